@@ -1,0 +1,183 @@
+"""Writing and loading a bundle: a folder of two ONNX graphs and their manifest."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from models.errors import BundleError
+from models.graph import FLOAT, Tensor, read_graph
+from models.manifest import FORMAT_VERSION, MANIFEST_FILE, MULTIPLIER_FILE, POLICY_FILE, Manifest
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """A checked bundle. The graphs' bytes are kept, so that what was checked is what runs.
+
+    Attributes:
+        path: its folder.
+        manifest: what it says about itself.
+        policy: the bytes of policy.onnx: "observation" [batch, O] → "action" [batch, 2], the mean action
+            within bounds.
+        multiplier: the bytes of multiplier.onnx: "observation" [batch, O] → "multiplier" [batch], λ_ξ(s) ≥ 0
+            (paper eq. 14).
+        id: name and the first 12 digits of the SHA-256 of manifest.json, which covers the graphs' digests.
+    """
+
+    path: Path
+    manifest: Manifest
+    policy: bytes
+    multiplier: bytes
+    id: str
+
+    @property
+    def policy_path(self) -> Path:
+        """Where policy.onnx lies."""
+        return self.path / POLICY_FILE
+
+    @property
+    def multiplier_path(self) -> Path:
+        """Where multiplier.onnx lies."""
+        return self.path / MULTIPLIER_FILE
+
+    @staticmethod
+    def load(path: str | Path) -> Bundle:
+        """Loads a bundle and checks everything that can be checked without running it.
+
+        Args:
+            path: the bundle's folder.
+
+        Raises:
+            BundleError: one line that names the file and what is wrong: a file is missing, the manifest is
+                malformed or of another format version, a digest differs, a graph is no ONNX, keeps data outside
+                the file, uses another opset than stated, or has other inputs or outputs than the layout asks for.
+        """
+        folder = Path(path)
+        if not folder.is_dir():
+            raise BundleError(
+                f"{folder}: no such bundle (a folder with {MANIFEST_FILE}, {POLICY_FILE}, {MULTIPLIER_FILE})"
+            )
+        text = _read(folder / MANIFEST_FILE)
+        manifest = _parse_manifest(folder / MANIFEST_FILE, text)
+        policy = _read_checked(folder / POLICY_FILE, manifest)
+        multiplier = _read_checked(folder / MULTIPLIER_FILE, manifest)
+        _check_graph(folder / POLICY_FILE, policy, manifest, Tensor("action", FLOAT, (None, 2)))
+        _check_graph(folder / MULTIPLIER_FILE, multiplier, manifest, Tensor("multiplier", FLOAT, (None,)))
+        identity = f"{manifest.name}@{hashlib.sha256(text).hexdigest()[:12]}"
+        return Bundle(path=folder, manifest=manifest, policy=policy, multiplier=multiplier, id=identity)
+
+
+def write_bundle(path: str | Path, policy_onnx: bytes, multiplier_onnx: bytes, manifest: Manifest) -> Bundle:
+    """Writes a bundle beside its final place, loads it back, and only then renames it into place.
+
+    Args:
+        path: the folder to create; an existing bundle there is replaced, any other folder is refused.
+        policy_onnx: the bytes of policy.onnx.
+        multiplier_onnx: the bytes of multiplier.onnx.
+        manifest: what to write as manifest.json; its sha256 is computed here.
+
+    Returns:
+        The bundle, loaded from its final place.
+
+    Raises:
+        BundleError: if the place is taken or cannot be written, or the bundle would not load.
+    """
+    target = Path(path)
+    if target.exists() and not (target / MANIFEST_FILE).is_file():
+        raise BundleError(f"{target}: exists and is not a bundle; not replaced")
+    digests = {POLICY_FILE: _digest(policy_onnx), MULTIPLIER_FILE: _digest(multiplier_onnx)}
+    complete = manifest.model_dump() | {"sha256": digests}
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        temporary = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
+        try:
+            fresh = temporary / "new"
+            fresh.mkdir()
+            (fresh / POLICY_FILE).write_bytes(policy_onnx)
+            (fresh / MULTIPLIER_FILE).write_bytes(multiplier_onnx)
+            (fresh / MANIFEST_FILE).write_text(Manifest.model_validate(complete).to_json(), encoding="utf-8")
+            Bundle.load(fresh)
+            _move_into_place(fresh, target, aside=temporary / "old")
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
+    except OSError as error:
+        raise BundleError(f"{target}: cannot be written: {error.strerror or error}") from error
+    return Bundle.load(target)
+
+
+def _move_into_place(fresh: Path, target: Path, aside: Path) -> None:
+    """Renames a folder to its final name; one that had the name goes aside, and comes back if that fails."""
+    if not target.exists():
+        fresh.rename(target)
+        return
+    target.rename(aside)
+    try:
+        fresh.rename(target)
+    except OSError:
+        aside.rename(target)
+        raise
+
+
+def _digest(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()
+
+
+def _read(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise BundleError(f"{path}: cannot be read: {error.strerror or error}") from error
+
+
+def _parse_manifest(path: Path, text: bytes) -> Manifest:
+    try:
+        raw = json.loads(text)
+    except ValueError as error:
+        raise BundleError(f"{path}: not JSON: {error}") from error
+    version = raw.get("format_version") if isinstance(raw, dict) else None
+    if version != FORMAT_VERSION:
+        raise BundleError(
+            f"{path}: format_version is {version!r}, this version of lagnet reads {FORMAT_VERSION}"
+        )
+    try:
+        return Manifest.model_validate(raw)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise BundleError(f"{path}: {where + ': ' if where else ''}{first['msg']}") from error
+
+
+def _read_checked(path: Path, manifest: Manifest) -> bytes:
+    stated = manifest.sha256.get(path.name)  # type: ignore[call-overload]
+    if stated is None:
+        raise BundleError(f"{path.parent / MANIFEST_FILE}: sha256 of {path.name} is missing")
+    data = _read(path)
+    found = _digest(data)
+    if found != stated:
+        raise BundleError(
+            f"{path}: sha256 is {found[:12]}…, the manifest says {stated[:12]}…: changed since export"
+        )
+    return data
+
+
+def _check_graph(path: Path, data: bytes, manifest: Manifest, output: Tensor) -> None:
+    try:
+        graph = read_graph(data)
+    except BundleError as error:
+        raise BundleError(f"{path}: {error}") from error
+    observation = Tensor("observation", FLOAT, (None, manifest.observation_size))
+    if graph.external:
+        raise BundleError(f"{path}: keeps tensors outside the file (ONNX external data), which is refused")
+    if graph.opsets != {"": manifest.opset}:
+        stated = ", ".join(f"{domain or 'ai.onnx'} {version}" for domain, version in graph.opsets.items())
+        raise BundleError(f"{path}: uses opset {stated}, the manifest says ai.onnx {manifest.opset}")
+    for what, found, expected in (("input", graph.inputs, observation), ("output", graph.outputs, output)):
+        if found != (expected,):
+            listed = ", ".join(str(tensor) for tensor in found) or "none"
+            raise BundleError(f"{path}: {what} is {listed}, expected {expected}")

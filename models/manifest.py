@@ -1,0 +1,114 @@
+"""manifest.json: what a bundle says about itself."""
+
+from __future__ import annotations
+
+import json
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, field_validator, model_validator
+
+FORMAT_VERSION: Literal[1] = 1
+"""Version of the bundle format that this code reads and writes."""
+POLICY_FILE = "policy.onnx"
+MULTIPLIER_FILE = "multiplier.onnx"
+MANIFEST_FILE = "manifest.json"
+
+Positive = Annotated[int, Field(ge=1)]
+Pair = tuple[float, float]
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class ObservationBlock(_Strict):
+    """One named run of numbers in the observation, as in `pointgoal.observation.Block`.
+
+    Attributes:
+        name: the sensor.
+        start: index of its first number.
+        size: how many numbers.
+        unit: their unit; "1" for dimensionless readings.
+    """
+
+    name: Annotated[str, Field(min_length=1)]
+    start: Annotated[int, Field(ge=0)]
+    size: Positive
+    unit: str
+
+
+class Manifest(_Strict):
+    """What a bundle says about itself; written as manifest.json.
+
+    Attributes:
+        format_version: version of the bundle format.
+        name: the bundle's name: letters, digits, dot, dash, underscore.
+        created: when it was exported, with its time zone.
+        task: gymnasium id of the task it was trained on.
+        level: the task's level.
+        algorithm: what trained it.
+        observation_layout: the observation's blocks, in order, without gaps.
+        observation_size: count of the observation's numbers.
+        action_low: lower bounds of the action.
+        action_high: upper bounds of the action.
+        threshold: the gate `risk` activates the filter where λ is above this.
+        threshold_source: how the threshold was set.
+        hazard_radius: radius of a hazard [m].
+        opset: version of the standard ONNX operators that both graphs use.
+        sha256: file name → SHA-256 of the file, hexadecimal; `write_bundle` fills it in.
+        training: the training's configuration.
+        figures: name → number, for example the evaluation's return and cost.
+        versions: package → version used for the export.
+    """
+
+    format_version: Literal[1] = FORMAT_VERSION
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
+    created: AwareDatetime
+    task: Annotated[str, Field(min_length=1)]
+    level: Annotated[int, Field(ge=0, le=2)]
+    algorithm: Annotated[str, Field(min_length=1)]
+    observation_layout: tuple[ObservationBlock, ...]
+    observation_size: Positive
+    action_low: Pair
+    action_high: Pair
+    threshold: Annotated[float, Field(ge=0.0)]
+    threshold_source: Annotated[str, Field(min_length=1)]
+    hazard_radius: Annotated[float, Field(gt=0.0)]
+    opset: Positive
+    sha256: dict[
+        Literal["policy.onnx", "multiplier.onnx"], Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+    ] = {}
+    training: dict[str, Any] = {}
+    figures: dict[str, float] = {}
+    versions: dict[str, str] = {}
+
+    @field_validator("training")
+    @classmethod
+    def _training_is_json(cls, training: dict[str, Any]) -> dict[str, Any]:
+        try:
+            json.dumps(training, allow_nan=False)
+        except TypeError as error:
+            raise ValueError(f"must be plain JSON: {error}") from error
+        return training
+
+    @model_validator(mode="after")
+    def _agrees_with_itself(self) -> Self:
+        start, names = 0, set()
+        for block in self.observation_layout:
+            if block.start != start or block.name in names:
+                raise ValueError(
+                    f"observation_layout: block {block.name!r} overlaps, leaves a gap or stands twice"
+                )
+            names.add(block.name)
+            start += block.size
+        if start != self.observation_size:
+            raise ValueError(
+                f"observation_layout has {start} numbers, observation_size says {self.observation_size}"
+            )
+        if not all(low < high for low, high in zip(self.action_low, self.action_high, strict=True)):
+            raise ValueError("action_low must be below action_high")
+        return self
+
+    def to_json(self) -> str:
+        """The text of manifest.json."""
+        return json.dumps(self.model_dump(mode="json"), indent=2, allow_nan=False) + "\n"
