@@ -1,0 +1,1 @@
+"""Training: networks, rollouts, the algorithms, checkpoints, `lagnet-train` and `lagnet-export`."""

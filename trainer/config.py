@@ -1,0 +1,137 @@
+"""The settings of a training run: one flat dataclass, every field a command-line flag."""
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from trainer.errors import ConfigError
+
+AlgorithmName = Literal[
+    "ppo", "ppo-lag", "trpo-lag", "cppo-pid", "ipo", "cpo", "scpo", "lagnet", "lagnet-foresight"
+]
+
+
+@dataclass(frozen=True)
+class Config:
+    """Trains one policy (and, where the algorithm has one, its multiplier network) on one task."""
+
+    algorithm: AlgorithmName = "lagnet"
+    """Learning algorithm. `lagnet` is the paper's; `lagnet-foresight` is ours."""
+    task: str = "PointGoal1-v0"
+    """Gymnasium id of the task; it must offer a vector environment that reports info["cost"]."""
+    cost: Literal["depth", "indicator"] = "depth"
+    """Cost of a step: depth inside the hazards [m] (the paper's), or 1 inside any hazard."""
+    cost_limit: float = 1.0
+    """Cost limit d on the undiscounted cost of an episode; the state-wise limit is w = d / episode_steps."""
+    total_steps: int = 3_000_000
+    """Environment steps to train for, over all environments together."""
+    seed: int = 0
+    """Seed of everything random: layouts, initial weights, exploration, minibatches."""
+    out: Path | None = None
+    """Folder of the run (by convention runs/NAME). Must be new or empty."""
+    resume: Path | None = None
+    """Continue the run in this folder from its last checkpoint; takes no other flag."""
+
+    num_envs: int = 40
+    """Environments stepped side by side."""
+    epoch_steps: int = 20_000
+    """Environment steps between two updates, over all environments; a multiple of num_envs."""
+    episode_steps: int = 1000
+    """Steps of a full episode [steps]; turns the cost limit into the state-wise limit."""
+    threads: int = 2
+    """Threads for physics and for torch. Results repeat bit for bit only with the same number."""
+
+    discount: float = 0.99
+    """Discount γ of the reward and of the cost."""
+    gae: float = 0.95
+    """λ of generalised advantage estimation, for the reward and the cost."""
+    passes: int = 5
+    """Passes over an epoch's data in one update, at most."""
+    minibatch: int = 2000
+    """Samples in one minibatch."""
+    learning_rate: float = 3e-4
+    """Adam's step size for the actor; decays linearly to zero over the run."""
+    critic_learning_rate: float = 1e-3
+    """Adam's step size for the critics."""
+    clip: float = 0.2
+    """ε of PPO's clipped surrogate."""
+    kl_stop: float = 0.02
+    """An update ends early once a pass moved the policy by more than this mean KL divergence."""
+    entropy: float = 0.0
+    """Weight of the entropy bonus in PPO's objective."""
+    gradient_clip: float = 40.0
+    """Largest norm of a gradient, for the actor, the critics and the multiplier network each."""
+    critic_l2: float = 0.0
+    """Weight of Σ p² over the critics' parameters in their loss (OmniSafe's is 0.001)."""
+    initial_log_std: float = -0.5
+    """Initial log standard deviation of the policy's actions."""
+
+    multiplier_init: float = 20.0
+    """lagnet: the value λ_ξ(s) starts at in every state (the paper's is about 20)."""
+    multiplier_learning_rate: float = 3e-4
+    """lagnet: Adam's step size for the multiplier network's ascent on eq. 15."""
+    multiplier_passes: int = 1
+    """lagnet: passes of that ascent over an epoch's states."""
+
+    checkpoint_every: int = 10
+    """Epochs between two checkpoints. One is also written at the start, at the end and on Ctrl-C."""
+    tensorboard: bool = True
+    """Also write TensorBoard events into the run's folder."""
+
+    @property
+    def state_limit(self) -> float:
+        """State-wise limit w = d / episode_steps [cost per step]."""
+        return self.cost_limit / self.episode_steps
+
+    @property
+    def horizon(self) -> int:
+        """Steps of each environment in one epoch (T)."""
+        return self.epoch_steps // self.num_envs
+
+    @property
+    def epochs(self) -> int:
+        """Epochs in the run; the last one completes total_steps."""
+        return math.ceil(self.total_steps / self.epoch_steps)
+
+
+_POSITIVE = (
+    "total_steps", "num_envs", "epoch_steps", "episode_steps", "threads", "passes", "minibatch",
+    "learning_rate", "critic_learning_rate", "clip", "kl_stop", "gradient_clip",
+    "multiplier_learning_rate", "multiplier_passes", "checkpoint_every",
+)  # fmt: skip
+_NOT_NEGATIVE = ("cost_limit", "seed", "entropy", "critic_l2", "multiplier_init")
+_FRACTION = ("discount", "gae")
+
+
+def check(config: Config) -> None:
+    """Refuses settings that cannot work.
+
+    Args:
+        config: the settings to check.
+
+    Raises:
+        ConfigError: names the first field at fault, its value and what it must be.
+    """
+    values = {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}
+    for name, value in values.items():
+        if isinstance(value, float) and not math.isfinite(value):
+            raise ConfigError(f"{_flag(name)} must be a finite number, not {value}")
+    for name in _POSITIVE:
+        if values[name] <= 0:
+            raise ConfigError(f"{_flag(name)} must be above 0, not {values[name]}")
+    for name in _NOT_NEGATIVE:
+        if values[name] < 0:
+            raise ConfigError(f"{_flag(name)} must not be negative, not {values[name]}")
+    for name in _FRACTION:
+        if not 0 <= values[name] <= 1:
+            raise ConfigError(f"{_flag(name)} must lie between 0 and 1, not {values[name]}")
+    if config.epoch_steps % config.num_envs:
+        raise ConfigError(
+            f"--epoch-steps ({config.epoch_steps}) must be a multiple of --num-envs ({config.num_envs})"
+        )
+
+
+def _flag(name: str) -> str:
+    return "--" + name.replace("_", "-")

@@ -1,0 +1,271 @@
+"""`lagnet-export`: turns a run into a bundle, after checking that both compute the same."""
+
+import dataclasses
+import re
+import sys
+from contextlib import closing
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import numpy.typing as npt
+import onnxruntime
+import torch
+import tyro
+from rich.console import Console
+
+from models import BundleError, Manifest, ObservationBlock, write_bundle
+from pointgoal.observation import HAZARD_RADIUS, layout
+from trainer import checkpoint, onnx_graph
+from trainer.algorithms import Algorithm, build
+from trainer.calibration import Threshold, calibrate
+from trainer.closed_loop import Episodes, episodes
+from trainer.errors import CheckpointError, ExportError, TrainerError
+from trainer.learner import Learner
+from trainer.rollout import Inference
+from trainer.train import below, load_config, make_environments
+
+TOLERANCE = 1e-5
+"""Largest difference between torch and onnxruntime; relative to the value where that is above 1."""
+CHECKED = 1000
+"""Real observations on which both are compared."""
+SEED = 10_000
+"""Added to the run's seed for the calibration's layouts, which training never saw."""
+ENVIRONMENTS = 50
+NO_NETWORK = 1.0
+"""λ of an algorithm without a multiplier network: no state is told from another."""
+
+Floats = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class ExportConfig:
+    """Exports the last checkpoint of a run as a bundle: policy.onnx, multiplier.onnx, manifest.json."""
+
+    run: Annotated[Path, tyro.conf.Positional]
+    """Folder of the run."""
+    bundle: Annotated[Path, tyro.conf.Positional]
+    """Folder of the bundle to write."""
+    episodes: int = 300
+    """Deterministic closed-loop episodes that give the bundle its figures and its threshold."""
+    threads: int = 2
+    """Threads for physics and for torch."""
+
+
+class TrainedRun:
+    """What a run has learnt, in torch.
+
+    Attributes:
+        config: its settings.
+        learner: its networks.
+        algorithm: its algorithm, which may have a multiplier network.
+        steps: environment steps behind it.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        """Loads the last checkpoint.
+
+        Raises:
+            CheckpointError: if there is none, or it does not fit its settings.
+        """
+        self.config = load_config(folder)
+        arrays, facts = checkpoint.read(folder)
+        state = below(arrays, "learner.")
+        try:
+            inputs = state["normaliser.mean"].shape[0]
+            rng = np.random.default_rng(0)
+            self.learner = Learner(self.config, inputs, len(facts["action_low"]), rng)
+            self.algorithm: Algorithm = build(self.config.algorithm, self.learner)
+            self.learner.load_state_dict(state)
+            self.algorithm.load_state(facts["algorithm"])
+            self.steps = int(facts["epoch"]) * self.config.epoch_steps
+            self.low = np.asarray(facts["action_low"], np.float32)
+            self.high = np.asarray(facts["action_high"], np.float32)
+        except (KeyError, ValueError, IndexError) as error:
+            raise CheckpointError(f"the checkpoint in {folder} does not fit its settings: {error}") from error
+
+    def actions(self, observation: Floats) -> Floats:
+        """The mean action [B, a] within bounds for raw observations [B, n], by torch."""
+        with torch.no_grad():
+            mean, _ = self.learner.policy(self._normalised(observation))
+        action: Floats = np.clip(mean.numpy(), self.low, self.high)
+        return action
+
+    def multipliers(self, observation: Floats) -> Floats:
+        """λ [B] of raw observations [B, n], by torch; a constant without a multiplier network."""
+        network = self.algorithm.multiplier_network()
+        if network is None:
+            return np.full(observation.shape[0], NO_NETWORK, np.float32)
+        with torch.no_grad():
+            return np.asarray(network(self._normalised(observation)).numpy())
+
+    def _normalised(self, observation: Floats) -> torch.Tensor:
+        return torch.from_numpy(self.learner.normaliser(observation))
+
+    def policy(self) -> "Inference":
+        """The policy's mean for few observations at a time."""
+        return Inference(self.learner.actor.detach().numpy(), self.learner.actor_shape)
+
+    def graphs(self) -> tuple[bytes, bytes]:
+        """policy.onnx and multiplier.onnx."""
+        learner = self.learner
+        mean, inverse = learner.normaliser.scale()
+        shape = learner.actor_shape
+        actor = learner.actor.detach().numpy()[: shape.size]
+        policy = onnx_graph.policy_graph(actor, shape, mean, inverse, self.low, self.high)
+        network = self.algorithm.multiplier_network()
+        if network is None:
+            return policy, onnx_graph.constant_graph(shape.inputs, NO_NETWORK)
+        xi = network.parameters.detach().numpy()[0]
+        multiplier = onnx_graph.multiplier_graph(xi, learner.critic_shape, mean, inverse, network.scale)
+        return policy, multiplier
+
+
+def export(config: ExportConfig) -> Manifest:
+    """Writes the bundle of a run.
+
+    Args:
+        config: what to export where.
+
+    Returns:
+        The manifest that was written.
+
+    Raises:
+        TrainerError: if the run cannot be read, is of a task that a bundle cannot hold, or if torch and
+            onnxruntime differ.
+        BundleError: if the bundle cannot be written.
+    """
+    torch.set_num_threads(config.threads)
+    run = TrainedRun(config.run)
+    level = _level(run)
+    policy, multiplier = run.graphs()
+    played = play(run, config.episodes, config.threads)
+    seen = played.observation[np.isfinite(played.observation).all(-1)]
+    rng = np.random.default_rng(0)
+    differences = compare(
+        run, policy, multiplier, seen[rng.choice(len(seen), min(CHECKED, len(seen)), False)]
+    )
+    threshold = _threshold(run, played)
+    manifest = Manifest(
+        name=config.bundle.resolve().name,
+        created=datetime.now(UTC).replace(microsecond=0),
+        task=run.config.task,
+        level=level,
+        algorithm=run.config.algorithm,
+        observation_layout=tuple(ObservationBlock(**block) for block in layout(level).to_json()),
+        observation_size=layout(level).size,
+        action_low=(float(run.low[0]), float(run.low[1])),
+        action_high=(float(run.high[0]), float(run.high[1])),
+        threshold=threshold.value,
+        threshold_source=threshold.source,
+        hazard_radius=HAZARD_RADIUS,
+        opset=onnx_graph.OPSET,
+        training={k: v for k, v in dataclasses.asdict(run.config).items() if k not in {"out", "resume"}},
+        figures=_figures(played) | {"steps": float(run.steps)} | differences,
+        versions={name: version(name) for name in ("numpy", "torch", "onnx", "onnxruntime", "mujoco")},
+    )
+    return write_bundle(config.bundle, policy, multiplier, manifest).manifest
+
+
+def play(run: TrainedRun, count: int, threads: int) -> Episodes:
+    """Deterministic closed-loop episodes of a run's policy on layouts that training never saw."""
+    act = run.policy()
+    mean_inverse = run.learner.normaliser.scale()
+    low, high = run.low, run.high
+    settings = dataclasses.replace(run.config, num_envs=min(count, ENVIRONMENTS), threads=threads)
+    with closing(make_environments(settings)) as env:
+        return episodes(
+            env,
+            lambda observation: np.clip(act(observation, *mean_inverse), low, high),
+            count,
+            run.config.episode_steps,
+            SEED + run.config.seed,
+        )
+
+
+def compare(run: TrainedRun, policy: bytes, multiplier: bytes, observation: Floats) -> dict[str, float]:
+    """Holds the ONNX graphs against torch.
+
+    Args:
+        run: the torch side.
+        policy: policy.onnx.
+        multiplier: multiplier.onnx.
+        observation: raw observations [B, n].
+
+    Returns:
+        The largest difference of each graph.
+
+    Raises:
+        ExportError: if one is above TOLERANCE.
+    """
+    found = {}
+    for name, graph, expected in (
+        ("action", policy, run.actions(observation)),
+        ("multiplier", multiplier, run.multipliers(observation)),
+    ):
+        session = onnxruntime.InferenceSession(graph, providers=["CPUExecutionProvider"])
+        (computed,) = session.run([name], {"observation": observation})
+        difference = float((np.abs(computed - expected) / np.maximum(1.0, np.abs(expected))).max())
+        if not difference <= TOLERANCE:
+            raise ExportError(
+                f"torch and onnxruntime differ by {difference:.2g} in the {name} "
+                f"(at most {TOLERANCE:.0e} is allowed): no bundle written"
+            )
+        found[f"onnx_difference_{name}"] = difference
+    return found
+
+
+def _level(run: TrainedRun) -> int:
+    match = re.fullmatch(r"PointGoal(\d)-v\d+", run.config.task)
+    if match is None:
+        raise ExportError(f"a bundle is for a PointGoal task, not {run.config.task}")
+    level = int(match[1])
+    if run.learner.actor_shape.inputs != layout(level).size:
+        raise ExportError(
+            f"{run.config.algorithm} observes more than the robot's sensors give "
+            f"({run.learner.actor_shape.inputs} numbers, not {layout(level).size}): it cannot be exported"
+        )
+    return level
+
+
+def _threshold(run: TrainedRun, played: Episodes) -> Threshold:
+    if run.algorithm.multiplier_network() is None:
+        return Threshold(0.0, f"gate always open: {run.config.algorithm} has no multiplier network")
+    steps, count, size = played.observation.shape
+    multiplier = run.multipliers(np.nan_to_num(played.observation.reshape(-1, size))).reshape(steps, count)
+    return calibrate(multiplier, played.cost)
+
+
+def _figures(played: Episodes) -> dict[str, Any]:
+    violations = np.nansum(played.cost > 0, 0)
+    return {
+        "episodes": float(played.cost.shape[1]),
+        "return": float(played.returns.mean()),
+        "cost": float(played.costs.mean()),
+        "violating_steps": float(violations.mean()),
+        "episodes_with_violation": float((violations > 0).mean()),
+    }
+
+
+def main() -> None:
+    """Console script `lagnet-export`."""
+    console = Console(stderr=True, highlight=False, soft_wrap=True)
+    config = tyro.cli(ExportConfig, description=ExportConfig.__doc__)
+    try:
+        manifest = export(config)
+    except (TrainerError, BundleError) as error:
+        console.print(f"[red]lagnet-export:[/red] {error}")
+        sys.exit(1)
+    figures = manifest.figures
+    console.print(
+        f"{config.bundle}: return {figures['return']:.2f}, cost {figures['cost']:.3f} "
+        f"over {figures['episodes']:.0f} episodes"
+    )
+    console.print(f"threshold {manifest.threshold:.4g} ({manifest.threshold_source})")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,201 @@
+"""What every algorithm learns with: the parameters, their optimisers and the epoch's batch."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from trainer.advantage import gae, successor_values
+from trainer.config import Config
+from trainer.errors import CheckpointError, NonFiniteError
+from trainer.networks import Shape, gaussian, initial, log_probability, stacked
+from trainer.normaliser import Normaliser
+from trainer.rollout import Trajectory
+
+ADAM = ("step", "exp_avg", "exp_avg_sq")
+REWARD, COST = 0, 1
+"""Rows of the critics' parameters."""
+
+
+@dataclass
+class Batch:
+    """One epoch as samples in the order of time, B = T · N.
+
+    Attributes:
+        observation: normalised [B, n].
+        action: [B, a].
+        mean: the acting policy's mean action [B, a].
+        log_std: its log standard deviation [a].
+        log_prob: its log density of the action [B].
+        reward_advantage: A, mean 0 and deviation 1 [B].
+        cost_advantage: A_c, mean 0, its own scale kept [B].
+        targets: of the reward critic and the cost critic [2, B].
+        cost: C(s, a, s') [B].
+        horizon: T.
+    """
+
+    observation: Tensor
+    action: Tensor
+    mean: Tensor
+    log_std: Tensor
+    log_prob: Tensor
+    reward_advantage: Tensor
+    cost_advantage: Tensor
+    targets: Tensor
+    cost: Tensor
+    trajectory: Trajectory
+
+    @property
+    def size(self) -> int:
+        """B."""
+        return self.observation.shape[0]
+
+
+class Learner:
+    """Actor, both critics and the observation normaliser, with their optimisers.
+
+    Attributes:
+        actor: parameters of the Gaussian policy [P + a].
+        critics: parameters of the reward and the cost critic [2, P'].
+        actor_shape: layer sizes of the actor's network.
+        critic_shape: layer sizes of the critics, and of a multiplier network.
+    """
+
+    def __init__(self, config: Config, observations: int, actions: int, rng: np.random.Generator) -> None:
+        self.config = config
+        self.rng = rng
+        self.normaliser = Normaliser(observations)
+        self.actor_shape = Shape(observations, actions)
+        self.critic_shape = Shape(observations, 1)
+        log_std = torch.full((actions,), config.initial_log_std)
+        actor = torch.cat([initial(self.actor_shape, rng, 0.01), log_std])
+        critics = torch.stack([initial(self.critic_shape, rng, 0.1) for _ in (REWARD, COST)])
+        self.parameters: dict[str, Tensor] = {}
+        self.optimisers: dict[str, torch.optim.Adam] = {}
+        self.actor = self.add("actor", actor, config.learning_rate)
+        self.critics = self.add("critics", critics, config.critic_learning_rate)
+        self.progress = 0.0
+
+    def add(self, name: str, parameters: Tensor, learning_rate: float) -> Tensor:
+        """Registers parameters to be optimised by Adam and kept in checkpoints."""
+        leaf = parameters.clone().requires_grad_()
+        self.parameters[name] = leaf
+        self.optimisers[name] = torch.optim.Adam([leaf], lr=learning_rate, fused=True)
+        return leaf
+
+    def descend(self, name: str, gradient: Tensor) -> None:
+        """One Adam step of the named parameters along a gradient, clipped to the configured norm."""
+        parameters, optimiser = self.parameters[name], self.optimisers[name]
+        norm = gradient.norm()
+        parameters.grad = gradient * (self.config.gradient_clip / norm.clamp(min=self.config.gradient_clip))
+        optimiser.step()
+
+    def start_epoch(self, progress: float) -> None:
+        """Sets the actor's step size for the share of the run that is done [0, 1)."""
+        self.progress = progress
+        self.optimisers["actor"].param_groups[0]["lr"] = self.config.learning_rate * (1 - progress)
+
+    def policy(self, observation: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean [B, a] and log standard deviation [a] for normalised observations [B, n]."""
+        return gaussian(self.actor, observation, self.actor_shape)
+
+    def values(self, observation: Tensor) -> Tensor:
+        """Reward and cost values [2, B] of normalised observations [B, n]."""
+        return stacked(self.critics, observation, self.critic_shape)
+
+    def batch(self, trajectory: Trajectory, cost_discount: float | None = None) -> Batch:
+        """Turns a trajectory into samples with advantages and targets.
+
+        Args:
+            trajectory: one epoch.
+            cost_discount: γ of the cost if it differs from the reward's.
+
+        Returns:
+            The batch.
+
+        Raises:
+            NonFiniteError: if an observation, a reward or a cost is not finite.
+        """
+        for name in ("observation", "reward", "cost"):
+            if not np.isfinite(getattr(trajectory, name)).all():
+                raise NonFiniteError(f"the environment returned a {name} that is not finite")
+        T, N = trajectory.reward.shape
+        seen = self._normalised(trajectory.observation)
+        final = self._normalised(trajectory.final_observation)
+        with torch.no_grad():
+            values = self.values(seen).view(2, T + 1, N).numpy()
+            final_values = self.values(final).numpy()
+        config = self.config
+        advantages, targets = [], []
+        for k, signal, discount in (
+            (REWARD, trajectory.reward, config.discount),
+            (COST, trajectory.cost, config.discount if cost_discount is None else cost_discount),
+        ):
+            after = successor_values(values[k], trajectory.ended, trajectory.terminated, final_values[k])
+            advantage = gae(signal, values[k], after, trajectory.ended, discount, config.gae)
+            advantages.append(torch.from_numpy(advantage.reshape(-1)))
+            targets.append(torch.from_numpy((advantage + values[k][:-1]).reshape(-1)))
+        reward_advantage, cost_advantage = advantages
+        action, mean = _flat(trajectory.action), _flat(trajectory.mean)
+        log_std = self.actor.detach()[self.actor_shape.size :].clone()
+        return Batch(
+            observation=seen[: T * N],
+            action=action,
+            mean=mean,
+            log_std=log_std,
+            log_prob=log_probability(mean, log_std, action),
+            reward_advantage=(reward_advantage - reward_advantage.mean()) / (reward_advantage.std() + 1e-8),
+            cost_advantage=cost_advantage - cost_advantage.mean(),
+            targets=torch.stack(targets),
+            cost=_flat(trajectory.cost[..., None])[:, 0],
+            trajectory=trajectory,
+        )
+
+    def _normalised(self, observation: npt.NDArray[np.float32]) -> Tensor:
+        return _flat(self.normaliser(observation))
+
+    def state_dict(self) -> dict[str, npt.NDArray[Any]]:
+        """Arrays from which load_state_dict goes on bit for bit."""
+        state: dict[str, npt.NDArray[Any]] = {
+            "normaliser.mean": self.normaliser.mean,
+            "normaliser.variance": self.normaliser.variance,
+            "normaliser.count": np.asarray(self.normaliser.count),
+        }
+        for name, parameters in self.parameters.items():
+            state[name] = parameters.detach().numpy()
+            for key in ADAM:
+                moments = self.optimisers[name].state[parameters]
+                state[f"adam.{name}.{key}"] = moments[key].numpy() if moments else np.zeros(0, np.float32)
+        return state
+
+    def load_state_dict(self, state: dict[str, npt.NDArray[Any]]) -> None:
+        """Takes on a state that state_dict returned.
+
+        Raises:
+            CheckpointError: if a tensor is missing or has another shape.
+        """
+        for name, parameters in self.parameters.items():
+            found = state.get(name)
+            if found is None or found.shape != tuple(parameters.shape):
+                shape = None if found is None else found.shape
+                raise CheckpointError(
+                    f"the checkpoint's {name!r} has shape {shape}, this run's {tuple(parameters.shape)}"
+                )
+        for name, parameters in self.parameters.items():
+            with torch.no_grad():
+                parameters.copy_(torch.from_numpy(state[name].copy()))
+            if state[f"adam.{name}.step"].size:
+                self.optimisers[name].state[parameters] = {
+                    key: torch.from_numpy(state[f"adam.{name}.{key}"].copy()) for key in ADAM
+                }
+        self.normaliser.mean = state["normaliser.mean"].copy()
+        self.normaliser.variance = state["normaliser.variance"].copy()
+        self.normaliser.count = float(state["normaliser.count"])
+
+
+def _flat(array: npt.NDArray[np.float32]) -> Tensor:
+    """[..., k] → tensor [B, k]."""
+    return torch.from_numpy(np.ascontiguousarray(array, np.float32).reshape(-1, array.shape[-1]))

@@ -1,0 +1,328 @@
+"""`lagnet-train`: the training loop and its command line."""
+
+import dataclasses
+import json
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from time import perf_counter
+from types import FrameType
+from typing import Any
+
+import numpy as np
+import torch
+import tyro
+from gymnasium.vector import VectorEnv
+from rich.console import Console
+
+from trainer import checkpoint
+from trainer.algorithms import Algorithm, build
+from trainer.config import Config, check
+from trainer.errors import CheckpointError, ConfigError, TrainerError
+from trainer.learner import Learner
+from trainer.report import Bar, Events, ProgressFile, Row
+from trainer.rollout import Rollout, mean
+
+CONFIG = "config.json"
+Environments = VectorEnv[Any, Any, Any]
+
+
+@dataclass
+class Summary:
+    """How a call of `train` ended.
+
+    Attributes:
+        folder: of the run.
+        steps: environment steps done since the run began.
+        finished: whether that is all of them (False after Ctrl-C).
+        figures: closing figures over the last 500 episodes.
+        seconds: wall time of this call by part: simulation, inference, update, other [s].
+        trace: (seconds since the start of this call, mean return of the last 100 episodes), one an epoch.
+    """
+
+    folder: Path
+    steps: int
+    finished: bool
+    figures: dict[str, float | None]
+    seconds: dict[str, float]
+    trace: list[tuple[float, float | None]]
+
+
+def make_environments(config: Config) -> Environments:
+    """The task's vector environment.
+
+    Raises:
+        ConfigError: if gymnasium does not know the task or cannot make it.
+    """
+    import gymnasium
+
+    import pointgoal  # noqa: F401 (registers the tasks when run from a source tree)
+
+    arguments: dict[str, Any] = {"cost": config.cost, "num_threads": config.threads}
+    try:
+        return gymnasium.make_vec(config.task, num_envs=config.num_envs, **arguments)
+    except (gymnasium.error.Error, TypeError) as error:
+        raise ConfigError(f"cannot make the task {config.task!r}: {error}") from error
+
+
+class Run:
+    """One run: everything that moves from epoch to epoch, and its folder."""
+
+    def __init__(self, config: Config, folder: Path, env: Environments) -> None:
+        self.config = config
+        self.folder = folder
+        self.rng = np.random.default_rng(config.seed)
+        observation: Any = env.single_observation_space
+        self.bounds: Any = env.single_action_space
+        self.learner = Learner(config, observation.shape[0], self.bounds.shape[0], self.rng)
+        self.algorithm: Algorithm = build(config.algorithm, self.learner)
+        self.rollout = Rollout(env, config.horizon, config.episode_steps, config.seed, self.rng)
+        self.epoch = 0
+
+    @property
+    def steps(self) -> int:
+        """Environment steps done."""
+        return self.epoch * self.config.epoch_steps
+
+    def advance(self) -> Row:
+        """One epoch: gather, update; returns the row to log.
+
+        Raises:
+            NonFiniteError: if a loss or what the environment returned is not finite.
+        """
+        learner, rollout = self.learner, self.rollout
+        learner.start_epoch(self.steps / self.config.total_steps)
+        actor = learner.actor.detach().numpy()
+        trajectory = rollout.collect(actor, learner.actor_shape, learner.normaliser)
+        figures = rollout.figures
+        logged = self.algorithm.update(learner.batch(trajectory), figures)
+        seen = trajectory.observation[:-1]
+        learner.normaliser.update(seen.reshape(-1, seen.shape[-1]))
+        self.epoch += 1
+        fresh = figures.fresh
+        return {
+            "epoch": self.epoch,
+            "steps": self.steps,
+            "episodes": figures.total,
+            "episodes_ended": fresh,
+            "return": mean(list(figures.returns)[-fresh:] if fresh else []),
+            "cost": mean(list(figures.costs)[-fresh:] if fresh else []),
+            "length": mean([float(n) for n in list(figures.lengths)[-fresh:]] if fresh else []),
+            "return_100": mean(list(figures.returns)[-100:]),
+            "cost_100": figures.episode_cost,
+            "step_cost": figures.step_cost,
+            "action_std": float(np.exp(actor[learner.actor_shape.size :]).mean()),
+            **logged,
+        }
+
+    def save(self, written: int) -> None:
+        """Writes the checkpoint; `written` is the length of progress.csv that belongs to it [bytes].
+
+        Raises:
+            CheckpointError: if it cannot be written.
+        """
+        arrays = {f"learner.{k}": v for k, v in self.learner.state_dict().items()}
+        arrays |= {f"rollout.{k}": v for k, v in self.rollout.state_dict().items()}
+        facts = {
+            "epoch": self.epoch,
+            "progress_bytes": written,
+            "rng": self.rng.bit_generator.state,
+            "algorithm": self.algorithm.state(),
+            "action_low": np.asarray(self.bounds.low).tolist(),
+            "action_high": np.asarray(self.bounds.high).tolist(),
+        }
+        checkpoint.write(self.folder, arrays, facts)
+
+    def load(self) -> int:
+        """Takes on the folder's checkpoint; returns the length of progress.csv that belongs to it [bytes].
+
+        Raises:
+            CheckpointError: if there is none, or it does not fit this run.
+        """
+        arrays, facts = checkpoint.read(self.folder)
+        try:
+            self.learner.load_state_dict(below(arrays, "learner."))
+            self.rollout.load_state_dict(below(arrays, "rollout."))
+            self.algorithm.load_state(facts["algorithm"])
+            self.rng.bit_generator.state = facts["rng"]
+            self.epoch = int(facts["epoch"])
+            return int(facts["progress_bytes"])
+        except (KeyError, ValueError, IndexError) as error:
+            raise CheckpointError(
+                f"the checkpoint in {self.folder} does not fit this run: {error}"
+            ) from error
+
+
+def below(arrays: dict[str, Any], prefix: str) -> dict[str, Any]:
+    """The arrays whose names begin with the prefix, without it."""
+    return {name.removeprefix(prefix): value for name, value in arrays.items() if name.startswith(prefix)}
+
+
+def train(
+    config: Config,
+    make: Callable[[Config], Environments] = make_environments,
+    console: Console | None = None,
+) -> Summary:
+    """Trains, or continues, one run.
+
+    Args:
+        config: the settings; with `resume` set, everything else is read from that run.
+        make: makes the vector environment.
+        console: where the progress bar goes; None for none.
+
+    Returns:
+        How it ended.
+
+    Raises:
+        TrainerError: with one clear line, whatever goes wrong that the user can act on.
+    """
+    started = perf_counter()
+    config, folder, resumed = prepare(config)
+    torch.set_num_threads(config.threads)
+    with closing(make(config)) as env:
+        run = Run(config, folder, env)
+        length = run.load() if resumed and (folder / checkpoint.FILE).exists() else 0
+        table = ProgressFile(folder, length)
+        run.save(length)
+        with closing(table), closing(Events(folder, config.tensorboard, run.steps)) as events:
+            trace = _loop(run, table, events, console or Console(quiet=True), started)
+    spent = dict(run.rollout.seconds)
+    spent["total"] = perf_counter() - started
+    figures = run.rollout.figures
+    return Summary(
+        folder=folder,
+        steps=run.steps,
+        finished=run.epoch >= config.epochs,
+        figures={
+            "training_return": mean(list(figures.returns)),
+            "training_cost": mean(list(figures.costs)),
+            "training_episodes": float(len(figures.costs)),
+        },
+        seconds=spent,
+        trace=trace,
+    )
+
+
+def _loop(
+    run: Run, table: ProgressFile, events: Events, console: Console, started: float
+) -> list[tuple[float, float | None]]:
+    """Epochs until the run is done or Ctrl-C asks to stop, with checkpoints on the way."""
+    config = run.config
+    trace: list[tuple[float, float | None]] = []
+    with _stop_request() as stopping, Bar(config.total_steps, run.steps, console) as bar:
+        while run.epoch < config.epochs and not stopping():
+            clock = perf_counter()
+            row = run.advance()
+            table.add(row)
+            if run.epoch % config.checkpoint_every == 0:
+                table.sync()
+                run.save(table.length)
+            rate = config.epoch_steps / (perf_counter() - clock)
+            events.add(row | {"steps_per_second": rate}, run.steps)
+            bar.show(run.steps, row, rate)
+            trace.append((perf_counter() - started, row["return_100"]))
+    table.sync()
+    run.save(table.length)
+    return trace
+
+
+@contextmanager
+def _stop_request() -> Iterator[Callable[[], bool]]:
+    """Lets the first Ctrl-C end the current epoch; a second one interrupts at once."""
+    asked: list[int] = []
+    before = signal.getsignal(signal.SIGINT)
+
+    def ask(number: int, _: FrameType | None) -> None:
+        asked.append(number)
+        signal.signal(signal.SIGINT, before)
+
+    try:
+        signal.signal(signal.SIGINT, ask)
+    except ValueError:  # only the main thread receives signals; elsewhere there is nothing to ask
+        yield lambda: False
+        return
+    try:
+        yield lambda: bool(asked)
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def prepare(config: Config) -> tuple[Config, Path, bool]:
+    """Checks the settings and the run's folder before anything is spent.
+
+    Returns:
+        The settings to train with, the folder, and whether a run is continued.
+
+    Raises:
+        ConfigError: if a setting is at fault.
+        CheckpointError: if the folder cannot be used.
+    """
+    if config.resume is not None:
+        if config != Config(resume=config.resume):
+            raise ConfigError("--resume takes every setting from the run; give no other flag beside it")
+        return load_config(config.resume), config.resume, True
+    check(config)
+    if config.out is None:
+        raise ConfigError("give the run a folder: --out runs/NAME")
+    folder = config.out
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise CheckpointError(
+            f"{folder} exists and is not empty: choose another --out, or continue it with --resume {folder}"
+        )
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise CheckpointError(f"cannot make {folder}: {error.strerror}") from error
+    checkpoint.replace(folder / CONFIG, (json.dumps(_plain(config), indent=2) + "\n").encode())
+    return config, folder, False
+
+
+def _plain(config: Config) -> dict[str, Any]:
+    values = dataclasses.asdict(replace(config, out=None, resume=None))
+    return {name: value for name, value in values.items() if name not in {"out", "resume"}}
+
+
+def load_config(folder: Path) -> Config:
+    """The settings a run was started with.
+
+    Raises:
+        CheckpointError: if the folder holds none, or they are not for this version.
+    """
+    path = folder / CONFIG
+    try:
+        config = Config(**json.loads(path.read_text()))
+    except FileNotFoundError as error:
+        raise CheckpointError(f"{folder} is no run: it holds no {CONFIG}") from error
+    except (OSError, ValueError, TypeError) as error:
+        raise CheckpointError(f"{path} cannot be read: {error}") from error
+    check(config)
+    return config
+
+
+def main() -> None:
+    """Console script `lagnet-train`."""
+    console = Console(stderr=True)
+    config = tyro.cli(Config, description=Config.__doc__)
+    try:
+        summary = train(config, console=console)
+    except TrainerError as error:
+        console.print(f"[red]lagnet-train:[/red] {error}", highlight=False, soft_wrap=True)
+        sys.exit(1)
+    done = "finished" if summary.finished else "stopped"
+    rate = f"{summary.steps / summary.seconds['total']:,.0f}" if not config.resume else "–"
+    console.print(f"{done} after {summary.steps:,} steps ({rate} steps/s): {summary.folder}", highlight=False)
+    next_command = (
+        f"lagnet-export {summary.folder} models/{summary.folder.name}"
+        if summary.finished
+        else f"lagnet-train --resume {summary.folder}"
+    )
+    console.print(f"go on with: {next_command}", highlight=False, soft_wrap=True)
+    if not summary.finished:
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()
