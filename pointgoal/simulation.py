@@ -1,0 +1,370 @@
+"""Many robots in one MuJoCo batch: physics, reward, cost, goals and observations, without gymnasium."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import mujoco
+import numpy as np
+from mujoco.batch import Batch
+from numpy.typing import NDArray
+
+from pointgoal.layouts import sample_goal, sample_layout
+from pointgoal.observation import (
+    BIN_WIDTH,
+    HAZARD_RADIUS,
+    LIDAR_BINS,
+    LIDAR_RANGE,
+    NUM_HAZARDS,
+    NUM_VASES,
+    FloatArray,
+    layout,
+)
+from pointgoal.scene import PHYSICS_STEPS, ROBOT_QPOS, VASE_HEIGHT, VASE_QPOS, VASE_QVEL, build_scene
+
+BoolArray = NDArray[np.bool_]
+CostKind = Literal["depth", "indicator"]
+
+EPISODE_STEPS = 1000
+"""Control steps after which an episode is truncated."""
+GOAL_RADIUS = 0.3
+"""The goal is met at this distance of the robot's origin [m]."""
+REWARD_LIMIT = 10.0
+"""Rewards are clipped to ± this."""
+VASE_SPEED_THRESHOLD = 1e-4
+"""Level 2: a vase slower than this costs nothing [m/s]."""
+
+_SENSOR_NUMBERS = 12
+_RNG_WORDS = 6
+
+
+@dataclass
+class StepResult:
+    """What one control step of n robots gave.
+
+    Attributes:
+        observation: (n, 28 or 60).
+        reward: (n,).
+        cost: (n,).
+        terminated: (n,) a met goal could not be placed anew.
+        truncated: (n,) the episode's 1,000 steps are over.
+    """
+
+    observation: FloatArray
+    reward: FloatArray
+    cost: FloatArray
+    terminated: BoolArray
+    truncated: BoolArray
+
+    @staticmethod
+    def concatenate(results: Sequence[StepResult]) -> StepResult:
+        """The results of several simulations as one, in order."""
+        if len(results) == 1:
+            return results[0]
+        columns = zip(*(vars(result).values() for result in results), strict=True)
+        return StepResult(*(np.concatenate(column) for column in columns))
+
+
+@dataclass(frozen=True)
+class State:
+    """An exact state of n robots and their surroundings, to start from.
+
+    Attributes:
+        pose: (n, 3) x, y [m], heading [rad], in the world.
+        velocity: (n, 3) vx, vy [m/s] in the world, yaw rate [rad/s].
+        goal: (n, 2) [m].
+        hazards: (n, h, 2) [m].
+        vase_qpos: (n, m, 7) position [m] and quaternion.
+        vase_qvel: (n, m, 6) linear [m/s] and angular [rad/s] velocity.
+    """
+
+    pose: FloatArray
+    velocity: FloatArray
+    goal: FloatArray
+    hazards: FloatArray
+    vase_qpos: FloatArray
+    vase_qvel: FloatArray
+
+    def rows(self, rows: NDArray[np.intp] | slice) -> State:
+        """The chosen robots' states."""
+        return State(**{name: array[rows] for name, array in vars(self).items()})
+
+    @staticmethod
+    def from_mapping(state: Mapping[str, object], level: int, n: int) -> State:
+        """Check a mapping of arrays and make a state of it.
+
+        Raises:
+            ValueError: naming the field that is missing, unknown, of a wrong shape or not finite.
+        """
+        h, m = NUM_HAZARDS[level], NUM_VASES[level]
+        shapes = {
+            "pose": (n, 3),
+            "velocity": (n, 3),
+            "goal": (n, 2),
+            "hazards": (n, h, 2),
+            "vase_qpos": (n, m, VASE_QPOS),
+            "vase_qvel": (n, m, VASE_QVEL),
+        }
+        unknown = sorted(set(state) - set(shapes))
+        if unknown:
+            raise ValueError(f"state has unknown fields {unknown}; it takes {sorted(shapes)}")
+        arrays = {}
+        for name, shape in shapes.items():
+            if name not in state:
+                raise ValueError(f"state lacks {name!r} of shape {shape}")
+            array = np.asarray(state[name], dtype=np.float64)
+            if array.shape != shape:
+                raise ValueError(f"state {name!r} has shape {array.shape}, expected {shape}")
+            if not np.isfinite(array).all():
+                raise ValueError(f"state {name!r} is not finite")
+            arrays[name] = array
+        return State(**arrays)
+
+
+class Simulation:
+    """n robots, each in its own surroundings, stepped together on one thread.
+
+    Rows are independent: what a row does depends on its own generator, state and actions alone.
+    """
+
+    def __init__(self, level: int, n: int, cost: CostKind = "depth", model: mujoco.MjModel | None = None) -> None:
+        if cost not in ("depth", "indicator"):
+            raise ValueError(f"cost must be 'depth' or 'indicator', got {cost!r}")
+        self.level = level
+        self.n = n
+        self.cost_kind = cost
+        self.layout = layout(level)
+        self.model = build_scene(level) if model is None else model
+        self.batch = Batch(self.model, n, nthread=1, persistent=True)
+        self._qpos = self.batch.bind("qpos")
+        self._qvel = self.batch.bind("qvel")
+        self._ctrl = self.batch.bind("ctrl")
+        self._sensors = self.batch.bind("sensordata")
+        self._vase_qpos = self._qpos[:, ROBOT_QPOS:].reshape(n, -1, VASE_QPOS)
+        self._vase_qvel = self._qvel[:, ROBOT_QPOS:].reshape(n, -1, VASE_QVEL)
+        self.elapsed_steps = np.zeros(n, dtype=np.int64)
+        self.rngs = [np.random.default_rng() for _ in range(n)]
+        # Everything the lidars see, one column a thing: the goal, the hazards, the vases.
+        h, m = NUM_HAZARDS[level], NUM_VASES[level]
+        self._hazards, self._vases = slice(1, 1 + h), slice(1 + h, 1 + h + m)
+        self._x, self._y = np.zeros((n, 1 + h + m)), np.zeros((n, 1 + h + m))
+        self._goal_distance = np.zeros(n)
+        # Index of a thing's first lidar number in the flattened observations, for one scatter over rows and kinds.
+        channel = np.repeat([0, 1, 2], [1, h, m])
+        rows = np.arange(n)[:, None] * self.layout.size
+        self._lidar_start = rows + _SENSOR_NUMBERS + channel * LIDAR_BINS
+
+    @property
+    def pose(self) -> FloatArray:
+        """(n, 3) x, y [m], heading [rad] in the world, a copy."""
+        return self._qpos[:, :ROBOT_QPOS].copy()
+
+    @property
+    def velocity(self) -> FloatArray:
+        """(n, 3) vx, vy [m/s] in the world, yaw rate [rad/s], a copy."""
+        return self._qvel[:, :ROBOT_QPOS].copy()
+
+    @property
+    def vases(self) -> FloatArray:
+        """(n, m, 7) position [m] and quaternion of the vases, a copy."""
+        return self._vase_qpos.copy()
+
+    @property
+    def vase_velocity(self) -> FloatArray:
+        """(n, m, 6) linear [m/s] and angular [rad/s] velocity of the vases, a copy."""
+        return self._vase_qvel.copy()
+
+    @property
+    def goal(self) -> FloatArray:
+        """(n, 2) centre of the goal [m], a copy."""
+        return np.stack([self._x[:, 0], self._y[:, 0]], axis=-1)
+
+    @property
+    def hazards(self) -> FloatArray:
+        """(n, h, 2) centres of the hazards [m], a copy."""
+        return np.stack([self._x[:, self._hazards], self._y[:, self._hazards]], axis=-1)
+
+    def hazards_in_body_frame(self) -> FloatArray:
+        """(n, h, 2) centres of the hazards as the robot has them: x ahead, y to its left [m]."""
+        dx = self._x[:, self._hazards] - self._qpos[:, :1]
+        dy = self._y[:, self._hazards] - self._qpos[:, 1:2]
+        cos, sin = np.cos(self._qpos[:, 2:3]), np.sin(self._qpos[:, 2:3])
+        return np.stack([cos * dx + sin * dy, cos * dy - sin * dx], axis=-1)
+
+    def reset(self, rows: NDArray[np.intp]) -> None:
+        """Draw a new layout for each of the rows (k,), from its own generator."""
+        layouts = [sample_layout(self.rngs[i], self.level) for i in rows]
+        k, m = len(rows), NUM_VASES[self.level]
+        vase_qpos = np.zeros((k, m, VASE_QPOS))
+        for j, drawn in enumerate(layouts):
+            vase_qpos[j, :, :2] = drawn.vases
+            vase_qpos[j, :, 3] = np.cos(drawn.vase_yaws / 2)
+            vase_qpos[j, :, 6] = np.sin(drawn.vase_yaws / 2)
+        vase_qpos[:, :, 2] = VASE_HEIGHT
+        state = State(
+            pose=np.array([drawn.pose for drawn in layouts]),
+            velocity=np.zeros((k, 3)),
+            goal=np.array([drawn.goal for drawn in layouts]),
+            hazards=np.array([drawn.hazards for drawn in layouts]),
+            vase_qpos=vase_qpos,
+            vase_qvel=np.zeros((k, m, VASE_QVEL)),
+        )
+        self.set_state(rows, state)
+
+    def set_state(self, rows: NDArray[np.intp], state: State, elapsed_steps: NDArray[np.int64] | int = 0) -> None:
+        """Put rows (k,) into an exact state (leading axis k), everything awake, at the given step of the episode."""
+        k = len(rows)
+        # The reset wakes the vases and clears the solver's warm start, so that nothing of the old episode is left.
+        self.batch.reset(rows, stage=mujoco.mjtStage.mjSTAGE_NONE)
+        self._qpos[rows, :ROBOT_QPOS] = state.pose
+        self._qvel[rows, :ROBOT_QPOS] = state.velocity
+        self._qpos[rows, ROBOT_QPOS:] = state.vase_qpos.reshape(k, -1)
+        self._qvel[rows, ROBOT_QPOS:] = state.vase_qvel.reshape(k, -1)
+        self._x[rows, 0], self._y[rows, 0] = state.goal.T
+        self._x[rows, self._hazards] = state.hazards[..., 0]
+        self._y[rows, self._hazards] = state.hazards[..., 1]
+        self.elapsed_steps[rows] = elapsed_steps
+        self.batch.forward(rows)
+        self._goal_distance[rows] = np.hypot(*(state.goal - state.pose[:, :2]).T)
+
+    def step(self, action: FloatArray) -> StepResult:
+        """Advance every row by one control step of 0.02 s.
+
+        The order is the reference task's: simulate, reward, cost, maybe a new goal, observation.
+
+        Args:
+            action: (n, 2) thrust and turning, clipped to ±1.
+        """
+        np.clip(action, -1.0, 1.0, out=self._ctrl)
+        self.batch.step(nstep=PHYSICS_STEPS, stage=mujoco.mjtStage.mjSTAGE_ACC)
+        dx, dy, distance = self._relative()
+        goal_distance = distance[:, 0].copy()
+        met = goal_distance <= GOAL_RADIUS
+        reward = self._goal_distance - goal_distance + met
+        np.clip(reward, -REWARD_LIMIT, REWARD_LIMIT, out=reward)
+        cost = self._cost(distance[:, self._hazards])
+        terminated = np.zeros(self.n, dtype=np.bool_)
+        if met.any():
+            for row in np.flatnonzero(met):
+                terminated[row] = not self._renew_goal(row)
+            dx, dy, distance = self._relative()
+        self._goal_distance = distance[:, 0].copy()
+        self.elapsed_steps += 1
+        truncated = self.elapsed_steps >= EPISODE_STEPS
+        return StepResult(self._encode(dx, dy, distance), reward, cost, terminated, truncated)
+
+    def observe(self) -> FloatArray:
+        """(n, 28 or 60) observations of the present state."""
+        return self._encode(*self._relative())
+
+    def _relative(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """(n, k) world-frame offsets x, y from the robot to everything the lidars see, and their lengths [m]."""
+        self._x[:, self._vases] = self._vase_qpos[:, :, 0]
+        self._y[:, self._vases] = self._vase_qpos[:, :, 1]
+        dx = self._x - self._qpos[:, :1]
+        dy = self._y - self._qpos[:, 1:2]
+        return dx, dy, np.sqrt(dx * dx + dy * dy)
+
+    def _cost(self, hazard_distance: FloatArray) -> FloatArray:
+        """(n,) cost of the step: depth in hazards, and at level 2 contact with vases and their speed."""
+        cost = np.maximum(HAZARD_RADIUS - hazard_distance, 0.0).sum(axis=1)
+        if self.level == 2:
+            speed = np.linalg.norm(self._vase_qvel[:, :, :3], axis=2)
+            cost += self._sensors[:, _SENSOR_NUMBERS] + np.where(speed >= VASE_SPEED_THRESHOLD, speed, 0).sum(axis=1)
+        return (cost > 0).astype(np.float64) if self.cost_kind == "indicator" else cost
+
+    def _renew_goal(self, row: np.intp) -> bool:
+        """Draw a row's goal anew against where things stand now; False if there is no place for it."""
+        others = np.stack([self._x[row], self._y[row]], axis=-1)
+        others[0] = self._qpos[row, :2]
+        goal = sample_goal(self.rngs[row], self.level, others)
+        if goal is None:
+            return False
+        self._x[row, 0], self._y[row, 0] = goal
+        return True
+
+    def _encode(self, dx: FloatArray, dy: FloatArray, distance: FloatArray) -> FloatArray:
+        """(n, 28 or 60) observations from the sensors and the offsets (n, k) of what the lidars see."""
+        observation = np.zeros((self.n, self.layout.size))
+        observation[:, :_SENSOR_NUMBERS] = self._sensors[:, :_SENSOR_NUMBERS]
+        bearing = (np.arctan2(dy, dx) - self._qpos[:, 2:3]) * (1.0 / BIN_WIDTH)
+        np.remainder(bearing, LIDAR_BINS, out=bearing)
+        ahead = bearing.astype(np.int64)
+        alias = bearing - ahead
+        # A bearing of -1e-17 has remainder 16.0: the mask wraps it to bin 0, as it wraps the neighbours.
+        last = LIDAR_BINS - 1
+        reading = np.maximum(LIDAR_RANGE - distance, 0.0) / LIDAR_RANGE
+        flat = observation.reshape(-1)
+        np.maximum.at(flat, self._lidar_start + (ahead & last), reading)
+        np.maximum.at(flat, self._lidar_start + (ahead + 1 & last), alias * reading)
+        np.maximum.at(flat, self._lidar_start + (ahead - 1 & last), (1.0 - alias) * reading)
+        return observation
+
+    def state_dict(self) -> dict[str, np.ndarray]:
+        """Everything that the future depends on, as arrays with leading axis n.
+
+        A vase's sleep cannot be written back into MuJoCo, so taking the state wakes the vases here, too:
+        this simulation and one that loads the state go on alike, to the last bit.
+        """
+        state = {
+            "physics": self.batch.state.copy(),
+            "x": self._x.copy(),
+            "y": self._y.copy(),
+            "goal_distance": self._goal_distance.copy(),
+            "elapsed_steps": self.elapsed_steps.copy(),
+            "rng": np.array([_pack_rng(rng) for rng in self.rngs], dtype=np.uint64),
+        }
+        self.load_state_dict(state)
+        return state
+
+    def load_state_dict(self, state: Mapping[str, np.ndarray]) -> None:
+        """Go on from a state that `state_dict` gave.
+
+        Raises:
+            ValueError: naming the array that is missing or of another shape.
+        """
+        shapes = {
+            "physics": self.batch.state.shape,
+            "x": self._x.shape,
+            "y": self._y.shape,
+            "goal_distance": (self.n,),
+            "elapsed_steps": (self.n,),
+            "rng": (self.n, _RNG_WORDS),
+        }
+        for name, shape in shapes.items():
+            if name not in state or state[name].shape != shape:
+                found = state[name].shape if name in state else "nothing"
+                raise ValueError(f"simulation state {name!r}: expected shape {shape}, found {found}")
+        self.batch.reset(stage=mujoco.mjtStage.mjSTAGE_NONE)
+        self.batch.state[...] = state["physics"]
+        self.batch.forward()
+        # The forward pass moves the solver's warm start on; the saved one is what the next step starts from.
+        self.batch.state[...] = state["physics"]
+        self._x[...], self._y[...] = state["x"], state["y"]
+        self._goal_distance = state["goal_distance"].copy()
+        self.elapsed_steps[...] = state["elapsed_steps"]
+        self.rngs = [_unpack_rng(words) for words in state["rng"]]
+
+
+def _pack_rng(rng: np.random.Generator) -> list[int]:
+    """A PCG64 generator's state as six 64-bit words."""
+    state = rng.bit_generator.state
+    words = []
+    for name in ("state", "inc"):
+        words += [state["state"][name] >> 64, state["state"][name] & (2**64 - 1)]
+    return [*words, state["has_uint32"], state["uinteger"]]
+
+
+def _unpack_rng(words: np.ndarray) -> np.random.Generator:
+    """The inverse of `_pack_rng`."""
+    state_high, state_low, inc_high, inc_low, has_uint32, uinteger = (int(word) for word in words)
+    bits = np.random.PCG64()
+    bits.state = {
+        "bit_generator": "PCG64",
+        "state": {"state": state_high << 64 | state_low, "inc": inc_high << 64 | inc_low},
+        "has_uint32": has_uint32,
+        "uinteger": uinteger,
+    }
+    return np.random.Generator(bits)

@@ -1,0 +1,247 @@
+"""Many point robots at once, as a gymnasium vector environment on one MuJoCo batch a thread."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+from pointgoal.observation import FloatArray, ObservationLayout, layout
+from pointgoal.rendering import draw
+from pointgoal.scene import build_scene
+from pointgoal.simulation import CostKind, Simulation, State, StepResult
+
+
+def observation_space(observation_layout: ObservationLayout) -> spaces.Box:
+    """Lidar readings are in [0, 1]; the sensors are unbounded."""
+    low = np.full(observation_layout.size, -np.inf)
+    high = np.full(observation_layout.size, np.inf)
+    for block in observation_layout.blocks:
+        if block.name.endswith("lidar"):
+            rows = observation_layout.slice(block.name)
+            low[rows], high[rows] = 0.0, 1.0
+    return spaces.Box(low, high, dtype=np.float64)
+
+
+def action_space() -> spaces.Box:
+    """Thrust and turning, in ±1."""
+    return spaces.Box(-1.0, 1.0, (2,), dtype=np.float64)
+
+
+class PointGoalVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
+    """N PointGoal environments, stepped side by side and reset in the step in which they end.
+
+    ``info["cost"]`` (N,) is the cost of the step. On a step on which episodes end, the observations
+    returned are the next episodes' first ones; ``info["final_obs"]`` (N, size) holds the last ones in
+    the rows that ``info["_final_obs"]`` (N,) marks, and ``info["final_info"]`` their cost.
+    Row i seeded with s is the single environment seeded with s + i.
+
+    Args:
+        level: 0, 1 or 2.
+        num_envs: N.
+        cost: ``"depth"``, metres inside hazards (the paper's), or ``"indicator"``, 1 if that is above 0.
+        num_threads: threads that share the environments; 0 takes one a CPU.
+        render_mode: ``"rgb_array"`` or None.
+    """
+
+    metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": ["rgb_array"], "render_fps": 50}
+
+    def __init__(
+        self,
+        level: int = 1,
+        num_envs: int = 1,
+        cost: CostKind = "depth",
+        num_threads: int = 0,
+        render_mode: str | None = None,
+    ) -> None:
+        if num_envs < 1:
+            raise ValueError(f"num_envs must be at least 1, got {num_envs}")
+        self.level = level
+        self.num_envs = num_envs
+        self.render_mode = render_mode
+        self.layout = layout(level)
+        self.single_observation_space = observation_space(self.layout)
+        self.single_action_space = action_space()
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        threads = min(num_threads or os.cpu_count() or 1, num_envs)
+        bounds = np.linspace(0, num_envs, threads + 1).astype(int)
+        self._slices = [slice(a, b) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
+        model = build_scene(level)
+        self.simulations = [Simulation(level, part.stop - part.start, cost, model) for part in self._slices]
+        self._pool = ThreadPoolExecutor(threads, "pointgoal") if threads > 1 else None
+        self._cost = np.zeros(num_envs)
+        self._started = False
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[FloatArray, dict[str, Any]]:
+        """Start new episodes.
+
+        Args:
+            seed: one number s (row i takes s + i), or one a row, or None to go on with the generators.
+            options: ``"state"``: an exact state (pose, velocity, goal, hazards, vase_qpos, vase_qvel, each with
+                leading axis N); ``"reset_mask"`` (N,) bool: the rows to reset, the others stay as they are;
+                ``"elapsed_steps"`` (N,) int: how far into its episode each row starts, to stagger episodes.
+
+        Returns:
+            (N, size) observations, and an info with zero cost.
+
+        Raises:
+            ValueError: naming the option that is wrong.
+        """
+        options = dict(options or {})
+        state, mask = options.pop("state", None), options.pop("reset_mask", None)
+        elapsed = options.pop("elapsed_steps", None)
+        if options:
+            known = ["elapsed_steps", "reset_mask", "state"]
+            raise ValueError(f"reset has no options {sorted(options)}; it takes {known}")
+        self._seed(seed)
+        chosen = np.ones(self.num_envs, bool) if mask is None else _rows(mask, bool, self.num_envs, "reset_mask")
+        if not self._started and not chosen.all():
+            raise ValueError("reset_mask: the first reset must start every environment")
+        whole = None if state is None else State.from_mapping(state, self.level, self.num_envs)
+        steps = np.zeros(self.num_envs, np.int64)
+        if elapsed is not None:
+            steps = _rows(elapsed, np.int64, self.num_envs, "elapsed_steps")
+        for simulation, part in zip(self.simulations, self._slices, strict=True):
+            rows = np.flatnonzero(chosen[part])
+            if whole is None:
+                simulation.reset(rows)
+                simulation.elapsed_steps[rows] = steps[part][rows]
+            else:
+                simulation.set_state(rows, whole.rows(part).rows(rows), steps[part][rows])
+        self._started = True
+        self._cost = np.where(chosen, 0.0, self._cost)
+        observation = np.concatenate([simulation.observe() for simulation in self.simulations])
+        return observation, {"cost": self._cost.copy()}
+
+    def step(self, actions: FloatArray) -> tuple[FloatArray, FloatArray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Advance every environment by 0.02 s.
+
+        Args:
+            actions: (N, 2), clipped to ±1.
+
+        Returns:
+            (N, size) observations, (N,) rewards, terminations and truncations, and the info.
+
+        Raises:
+            ValueError: if the actions' shape is wrong or one is not finite.
+            RuntimeError: before the first reset.
+        """
+        if not self._started:
+            raise RuntimeError("step was called before reset")
+        actions = np.asarray(actions, np.float64)
+        if actions.shape != (self.num_envs, 2):
+            raise ValueError(f"actions have shape {actions.shape}, expected {(self.num_envs, 2)}")
+        if not np.isfinite(actions).all():
+            raise ValueError("actions are not finite")
+        parts = [actions[part] for part in self._slices]
+        if self._pool is None:
+            results = [self.simulations[0].step(parts[0])]
+        else:
+            results = list(self._pool.map(Simulation.step, self.simulations, parts))
+        result = StepResult.concatenate(results)
+        self._cost = result.cost
+        info: dict[str, Any] = {"cost": result.cost}
+        done = result.terminated | result.truncated
+        if done.any():
+            info["final_obs"], info["_final_obs"] = result.observation.copy(), done
+            info["final_info"], info["_final_info"] = {"cost": result.cost, "_cost": done}, done
+            for simulation, part in zip(self.simulations, self._slices, strict=True):
+                rows = np.flatnonzero(done[part])
+                if len(rows):
+                    simulation.reset(rows)
+                    result.observation[part] = simulation.observe()
+        return result.observation, result.reward, result.terminated, result.truncated, info
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """One picture (height, width, 3) uint8 for each environment, or None without a render mode."""
+        if self.render_mode is None:
+            return None
+        pictures = []
+        for simulation, part in zip(self.simulations, self._slices, strict=True):
+            pictures += [draw(simulation, row, cost) for row, cost in enumerate(self._cost[part])]
+        return tuple(pictures)
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Stop the threads."""
+        if self._pool is not None:
+            self._pool.shutdown()
+
+    @property
+    def pose(self) -> FloatArray:
+        """(N, 3) x, y [m], heading [rad] in the world."""
+        return self._gather("pose")
+
+    @property
+    def velocity(self) -> FloatArray:
+        """(N, 3) vx, vy [m/s] in the world, yaw rate [rad/s]."""
+        return self._gather("velocity")
+
+    @property
+    def goal(self) -> FloatArray:
+        """(N, 2) centres of the goals [m]."""
+        return self._gather("goal")
+
+    @property
+    def hazards(self) -> FloatArray:
+        """(N, h, 2) centres of the hazards [m]."""
+        return self._gather("hazards")
+
+    @property
+    def elapsed_steps(self) -> np.ndarray:
+        """(N,) steps since the episodes' starts."""
+        return self._gather("elapsed_steps")
+
+    def hazards_in_body_frame(self) -> FloatArray:
+        """(N, h, 2) centres of the hazards: x ahead of the robot, y to its left [m]."""
+        return np.concatenate([simulation.hazards_in_body_frame() for simulation in self.simulations])
+
+    def state_dict(self) -> dict[str, np.ndarray]:
+        """Everything that the future depends on, as arrays; see `Simulation.state_dict`."""
+        parts = [simulation.state_dict() for simulation in self.simulations]
+        state = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+        return {**state, "cost": self._cost.copy()}
+
+    def load_state_dict(self, state: dict[str, np.ndarray]) -> None:
+        """Go on from a state that `state_dict` gave.
+
+        Raises:
+            ValueError: if it is of another level or number of environments.
+        """
+        for simulation, part in zip(self.simulations, self._slices, strict=True):
+            simulation.load_state_dict({name: array[part] for name, array in state.items()})
+        self._cost = state["cost"].copy()
+        self._started = True
+
+    def _gather(self, name: str) -> Any:
+        return np.concatenate([getattr(simulation, name) for simulation in self.simulations])
+
+    def _seed(self, seed: int | Sequence[int | None] | None) -> None:
+        if seed is None and self._started:
+            return
+        if seed is None or isinstance(seed, int | np.integer):
+            seeds = [None if seed is None else int(seed) + i for i in range(self.num_envs)]
+        else:
+            seeds = list(seed)
+        if len(seeds) != self.num_envs:
+            raise ValueError(f"seed has {len(seeds)} numbers, expected one or {self.num_envs}")
+        for simulation, part in zip(self.simulations, self._slices, strict=True):
+            for row, number in enumerate(seeds[part]):
+                if number is not None or not self._started:
+                    simulation.rngs[row] = seeding.np_random(number)[0]
+
+
+def _rows(values: Any, dtype: Any, n: int, name: str) -> np.ndarray:
+    array = np.asarray(values, dtype)
+    if array.shape != (n,):
+        raise ValueError(f"{name} has shape {array.shape}, expected {(n,)}")
+    return array
