@@ -1,0 +1,53 @@
+"""The certificate of one action: one exact step of the model, the path within it, and a backup from where it ends."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from filter.backups import best_backup
+from filter.compiled import compiled
+from filter.config import Settings
+from filter.obstacles import FAR, least_gap
+from filter.robot import State, advance, stopping
+
+FloatArray = NDArray[np.float64]
+
+
+@compiled
+def certify(
+    settings: Settings,
+    obstacles: FloatArray,
+    count: int,
+    state: State,
+    thrust: float,
+    turn: float,
+    enough: float,
+) -> tuple[float, int, int, int]:
+    """How far the robot surely stays from every obstacle if it takes an action now and a backup afterwards.
+
+    Args:
+        settings: the filter's numbers.
+        obstacles: (M, COLUMNS), radii with the margin.
+        count: how many of them there are.
+        state: the measured state.
+        thrust: u1.
+        turn: u2.
+        enough: stop looking at a clearance of this much [m]; 0 asks only whether the action is certified.
+
+    Returns:
+        The clearance [m], at or above 0 if the action is certified; the obstacle that bounds it; the backup; its
+        steps of thrust.
+    """
+    half = settings.robot.substeps // 2
+    middle = advance(settings.robot, state, thrust, turn, half)
+    after = advance(settings.robot, middle, thrust, turn, settings.robot.substeps - half)
+    value, blocker, kind, steps = best_backup(
+        settings, obstacles, count, stopping(settings.robot, after), enough
+    )
+    first, at_first = least_gap(obstacles, count, state.x, state.y, middle.x, middle.y, blocker, -FAR)
+    second, at_second = least_gap(obstacles, count, middle.x, middle.y, after.x, after.y, blocker, -FAR)
+    if min(first, second) < value:
+        value = min(first, second)
+        blocker = at_first if first < second else at_second
+    return value, blocker, kind, steps

@@ -1,0 +1,134 @@
+"""What the pseudo-lidar leaves possible: every place in which a hazard can be, given the readings.
+
+A hazard at distance d in bin b, at the share alpha of the bin's width, gives the reading s = 1 - d / 3 to its own
+bin, alpha s to the next and (1 - alpha) s to the one before, and a bin shows the largest of what it is given.
+So whatever else there is, a hazard in bin b obeys
+
+    s <= R[b],   alpha s <= R[b + 1],   (1 - alpha) s <= R[b - 1].
+
+For each s the share alpha is thus in [1 - R[b-1] / s, R[b+1] / s]: one point where a single hazard is alone, and
+a wedge that widens with the distance behind it, where others could hide. The union over the bins holds every
+hazard within the lidar's range, aliasing and hazards that share a bin included.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from filter.compiled import compiled
+from filter.obstacles import FloatArray, gap
+from pointgoal.observation import BIN_WIDTH, LIDAR_BINS, LIDAR_RANGE
+
+IntArray = NDArray[np.int64]
+
+PIECES = 4
+"""Pieces along the range that a bin's region is cut into."""
+SPLITS = 3
+"""Pieces across the bin's width, at most."""
+CONES = LIDAR_BINS * PIECES * SPLITS
+"""The most obstacles that one scan gives."""
+_EDGES = (0.0, 0.12, 0.35, 0.8)
+_ROUNDING = 1e-9
+
+
+@compiled
+def shares(reading: float, before: float, after: float) -> tuple[float, float]:
+    """The shares of the bin's width in which a hazard of this reading can be, given the neighbours' readings."""
+    low = max(1.0 - before / reading - _ROUNDING, 0.0)
+    high = min(after / reading + _ROUNDING, 1.0)
+    return low, high
+
+
+@compiled
+def decode(
+    readings: FloatArray, reach: float, grow: float, spread: float, out: FloatArray, source: IntArray
+) -> int:
+    """Cover every place in which a hazard can be with round cones.
+
+    Args:
+        readings: (16,) the hazards' lidar.
+        reach: how far out to look [m].
+        grow: radius of a hazard and margin [m].
+        spread: bound on the error of a bearing [rad]; adds its arc to the radius.
+        out: (>= CONES, COLUMNS) receives the obstacles.
+        source: (>= CONES,) receives each one's bin.
+
+    Returns:
+        How many obstacles there are.
+    """
+    count = 0
+    for b in range(LIDAR_BINS):
+        before = readings[(b + LIDAR_BINS - 1) % LIDAR_BINS]
+        after = readings[(b + 1) % LIDAR_BINS]
+        strongest = min(readings[b], before + after)
+        if strongest <= 0.0:
+            continue
+        nearest = LIDAR_RANGE * (1.0 - strongest)
+        for piece in range(PIECES):
+            start = nearest + _EDGES[piece]
+            if start > reach:
+                break
+            end = min(nearest + _EDGES[piece + 1] if piece + 1 < PIECES else max(reach, start), LIDAR_RANGE)
+            if start >= end and piece > 0:
+                break
+            count = _cover(b, start, end, before, after, grow, spread, out, source, count)
+    return count
+
+
+@compiled
+def _cover(
+    b: int,
+    start: float,
+    end: float,
+    before: float,
+    after: float,
+    grow: float,
+    spread: float,
+    out: FloatArray,
+    source: IntArray,
+    count: int,
+) -> int:
+    """Cover the part of a bin's region between two distances [m] with cones side by side.
+
+    Over the distance the upper share is convex and the lower one concave, so straight lines between the ends
+    hold the region; ``bend`` is what a cone's straight axis misses of a bearing that is linear in the distance.
+    """
+    weakest = max(1.0 - end / LIDAR_RANGE, 1e-6)
+    low, high = shares(weakest, before, after)
+    near_low, near_high = shares(1.0 - start / LIDAR_RANGE, before, after)
+    if near_low > near_high:
+        near_low = near_high = 0.5 * (near_low + near_high)
+    # Between the two ends the region lies within straight lines, unless the bin's own edge cuts it on the way.
+    if low <= 0.0:
+        near_low = 0.0
+    if high >= 1.0:
+        near_high = 1.0
+    parts = min(max(math.ceil((high - low) * SPLITS), 1), SPLITS)
+    for part in range(parts):
+        left = low + (high - low) * part / parts
+        right = low + (high - low) * (part + 1) / parts
+        # The region is narrower near by: a cone there need only reach what is left of its part.
+        close_left = min(max(left, near_low), near_high)
+        close_right = min(max(right, near_low), near_high)
+        first = (b + 0.5 * (close_left + close_right)) * BIN_WIDTH
+        last = (b + 0.5 * (left + right)) * BIN_WIDTH
+        cone = out[count]
+        cone[0] = start * math.cos(first)
+        cone[1] = start * math.sin(first)
+        cone[2] = end * math.cos(last) - cone[0]
+        cone[3] = end * math.sin(last) - cone[1]
+        if end - start < 1e-9:
+            cone[2] = 0.0
+            cone[3] = 0.0
+        shift = abs(last - first)
+        bend = 0.25 * shift * (end - start) + 0.125 * end * shift * shift
+        cone[4] = grow + bend + start * (0.5 * (close_right - close_left) * BIN_WIDTH + spread)
+        far = grow + bend + end * (0.5 * (right - left) * BIN_WIDTH + spread)
+        cone[5] = far - cone[4]
+        cone[6] = gap(cone, 0.0, 0.0)
+        source[count] = b
+        count += 1
+    return count
