@@ -55,8 +55,9 @@ class Bundle:
 
         Raises:
             BundleError: one line that names the file and what is wrong: a file is missing, the manifest is
-                malformed or of another format version, a digest differs, a graph is no ONNX, keeps data outside
-                the file, uses another opset than stated, or has other inputs or outputs than the layout asks for.
+                malformed or of another format version, a digest differs, a graph is no ONNX, keeps data
+                outside the file, uses another opset than stated, or has other inputs or outputs than the
+                layout asks for.
         """
         folder = Path(path)
         if not folder.is_dir():

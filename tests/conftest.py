@@ -21,10 +21,10 @@ def mlp(
 ) -> bytes:
     """A one-layer network "observation" → output; `nodes` go from "raw" to the output (by default a clip)."""
     rng = np.random.default_rng(seed)
-    weights = numpy_helper.from_array(rng.normal(0, 0.3, (size, outputs)).astype(np.float32), "weights")
+    weights = numpy_helper.from_array(rng.normal(0, 0.3, (outputs, size)).astype(np.float32), "weights")
     tail = nodes or [helper.make_node("Tanh", ["raw"], [output])]
     graph = helper.make_graph(
-        [helper.make_node("MatMul", ["observation", "weights"], ["raw"]), *tail],
+        [helper.make_node("Gemm", ["observation", "weights"], ["raw"], transB=1), *tail],
         output,
         [helper.make_tensor_value_info("observation", TensorProto.FLOAT, ["batch", size])],
         [

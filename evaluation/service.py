@@ -1,0 +1,105 @@
+"""A service started for a while: as a process of its own, stopped whatever happens."""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from monitor import Gate
+
+_START_SECONDS = 60.0
+_STOP_SECONDS = 10.0
+
+
+class ServiceError(RuntimeError):
+    """A service that did not start."""
+
+
+@dataclass(frozen=True)
+class Service:
+    """A running service; as a context manager it is stopped at the end, also on an error or Ctrl-C.
+
+    Attributes:
+        process: its process.
+        url: where it listens.
+    """
+
+    process: subprocess.Popen[str]
+    url: str
+
+    @staticmethod
+    def start(bundle: Path, gate: Gate, threshold: float | None = None) -> Service:
+        """Starts `lagnet-serve` on a free port of the loopback.
+
+        Raises:
+            ServiceError: if it ends or does not listen within a minute.
+        """
+        command = [sys.executable, "-m", "server.serve", str(bundle), "--port", "0", "--gate", gate]
+        if threshold is not None:
+            command += ["--threshold", str(threshold)]
+        return Service.run(command)
+
+    @staticmethod
+    def run(command: Sequence[str]) -> Service:
+        """Runs a command that prints one line of JSON with its "url" once it listens.
+
+        Raises:
+            ServiceError: if it ends or does not listen within a minute.
+        """
+        # A session of its own: Ctrl-C in the terminal reaches us alone, and we stop the service in order.
+        process = subprocess.Popen(
+            command,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+            env=os.environ | {"OMP_NUM_THREADS": "1"},
+        )
+        try:
+            return Service(process, _read_url(process))
+        except BaseException:
+            _stop(process)
+            raise
+
+    def stop(self) -> int:
+        """Stops it in order, or by force if that takes too long; returns its exit status."""
+        return _stop(self.process)
+
+    def __enter__(self) -> Self:
+        """The running service."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Stops it."""
+        self.stop()
+
+
+def _read_url(process: subprocess.Popen[str]) -> str:
+    if process.stdout is None or process.stderr is None:
+        raise ServiceError("the service has no output")
+    ready, _, _ = select.select([process.stdout], [], [], _START_SECONDS)
+    line = process.stdout.readline() if ready else ""
+    if not line:
+        _stop(process)
+        said = process.stderr.read().strip() or "it did not listen in time"
+        raise ServiceError(f"the service did not start: {said}")
+    return str(json.loads(line)["url"])
+
+
+def _stop(process: subprocess.Popen[str]) -> int:
+    process.terminate()
+    try:
+        process.wait(_STOP_SECONDS)
+    except subprocess.TimeoutExpired:
+        process.kill()
+    return process.wait()

@@ -1,0 +1,75 @@
+"""What stands before every request, as pure ASGI: the key and the limit on the body's size."""
+
+from __future__ import annotations
+
+import hmac
+import json
+
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+OPEN_PATHS = frozenset({"/healthz", "/readyz"})
+"""What an orchestrator may ask without a key."""
+
+
+class BodyTooLargeError(ValueError):
+    """A request's body is larger than the limit."""
+
+
+class Guard:
+    """Refuses requests without the key (401) and with a body above the limit (413).
+
+    Args:
+        app: what it guards.
+        api_key: the key that `Authorization: Bearer KEY` or `X-API-Key: KEY` must carry; None asks for none.
+        max_body: most bytes of a request's body.
+    """
+
+    def __init__(self, app: ASGIApp, api_key: str | None, max_body: int) -> None:
+        self._app = app
+        self._key = None if api_key is None else api_key.encode()
+        self._max_body = max_body
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Handles one connection."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        headers: dict[bytes, bytes] = dict(scope["headers"])
+        if self._key is not None and scope["path"] not in OPEN_PATHS and not _carries(headers, self._key):
+            await _refuse(send, 401, "header", "authorization", "a valid API key is required")
+            return
+        too_large = f"the body must not exceed {self._max_body} bytes"
+        stated = headers.get(b"content-length", b"0")
+        if stated.isdigit() and int(stated) > self._max_body:
+            await _refuse(send, 413, "body", "content-length", too_large)
+            return
+        received = 0
+
+        async def limited() -> Message:
+            nonlocal received
+            message = await receive()
+            if message["type"] == "http.request":
+                received += len(message.get("body", b""))
+                if received > self._max_body:
+                    raise BodyTooLargeError(too_large)
+            return message
+
+        await self._app(scope, limited, send)
+
+
+def _carries(headers: dict[bytes, bytes], key: bytes) -> bool:
+    scheme, _, bearer = headers.get(b"authorization", b"").partition(b" ")
+    given = bearer.strip() if scheme.lower() == b"bearer" else headers.get(b"x-api-key", b"")
+    return hmac.compare_digest(given, key)
+
+
+async def _refuse(send: Send, status: int, place: str, name: str, message: str) -> None:
+    detail = [{"loc": [place, name], "msg": message, "type": "refused"}]
+    body = json.dumps({"detail": detail}).encode()
+    headers = [(b"content-type", b"application/json"), (b"content-length", str(len(body)).encode())]
+    if status == 401:
+        headers.append((b"www-authenticate", b"Bearer"))
+    # The body was not read: the connection cannot carry another request.
+    headers.append((b"connection", b"close"))
+    await send({"type": "http.response.start", "status": status, "headers": headers})
+    await send({"type": "http.response.body", "body": body})

@@ -1,0 +1,121 @@
+"""One HTTP connection with a deadline over the whole exchange.
+
+HTTP libraries bound each read, so that a service which sends a byte now and then holds the caller for as long
+as it likes. Here whatever is left of the deadline bounds the next read.
+"""
+
+from __future__ import annotations
+
+import http.client
+import socket
+import time
+from typing import Any
+
+
+class DeadlineSocket(socket.socket):
+    """A socket whose reads end at one deadline, however many there are.
+
+    Attributes:
+        deadline: when they end, on the clock of `time.monotonic` [s].
+    """
+
+    deadline = 0.0
+
+    def recv_into(self, *arguments: Any) -> int:
+        """Reads what is there, or raises TimeoutError once the deadline has passed."""
+        self.settimeout(remaining(self.deadline))
+        return super().recv_into(*arguments)
+
+
+class Link:
+    """A connection that is opened when needed, kept, and opened anew after any fault.
+
+    Args:
+        host: whom to connect to.
+        port: where.
+        headers: sent with every request.
+    """
+
+    def __init__(self, host: str, port: int, headers: dict[str, str]) -> None:
+        self._host = host
+        self._port = port
+        self._headers = headers
+        self._open: tuple[http.client.HTTPConnection, DeadlineSocket] | None = None
+
+    def exchange(self, method: str, path: str, body: bytes | None, timeout: float) -> tuple[int, bytes]:
+        """One request and its reply.
+
+        Args:
+            method: "GET" or "POST"; it must be safe to send twice.
+            path: the path.
+            body: what to send, or None.
+            timeout: how long connecting, sending and reading may take altogether [s].
+
+        Returns:
+            Status and body.
+
+        Raises:
+            TimeoutError: if it takes longer.
+            OSError: if the connection fails.
+            http.client.HTTPException: if the reply is not HTTP.
+        """
+        deadline = time.monotonic() + timeout
+        kept = self._open is not None
+        try:
+            return self._exchange(method, path, body, deadline)
+        except ConnectionError:
+            # The other side may have closed a kept connection while it was idle; a fresh one is tried once.
+            if not kept:
+                raise
+        return self._exchange(method, path, body, deadline)
+
+    def close(self) -> None:
+        """Closes the connection."""
+        if self._open is not None:
+            self._open[0].close()
+            self._open = None
+
+    def _exchange(self, method: str, path: str, body: bytes | None, deadline: float) -> tuple[int, bytes]:
+        try:
+            connection, opened = self._open or self._connect(deadline)
+            opened.deadline = deadline
+            opened.settimeout(remaining(deadline))
+            connection.request(method, path, body, self._headers)
+            response = connection.getresponse()
+            content = response.read()
+        except (OSError, http.client.HTTPException):
+            # Half an exchange may be left in it: the next reply would be the answer to this request.
+            self.close()
+            raise
+        if response.will_close:
+            self.close()
+        return response.status, content
+
+    def _connect(self, deadline: float) -> tuple[http.client.HTTPConnection, DeadlineSocket]:
+        family, kind, protocol, _, address = socket.getaddrinfo(
+            self._host, self._port, type=socket.SOCK_STREAM
+        )[0]
+        opened = DeadlineSocket(family, kind, protocol)
+        try:
+            opened.settimeout(remaining(deadline))
+            opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            opened.connect(address)
+        except OSError:
+            opened.close()
+            raise
+        connection = http.client.HTTPConnection(self._host, self._port)
+        connection.sock = opened
+        self._open = (connection, opened)
+        return self._open
+
+
+def remaining(deadline: float) -> float:
+    """What is left until a deadline [s].
+
+    Raises:
+        TimeoutError: if nothing is.
+    """
+    left = deadline - time.monotonic()
+    if left <= 0.0:
+        raise TimeoutError("the deadline has passed")
+    return left

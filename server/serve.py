@@ -1,0 +1,190 @@
+"""The command `lagnet-serve`."""
+
+from __future__ import annotations
+
+import ipaddress
+import json
+import math
+import os
+import socket
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import Annotated
+
+import tyro
+import uvicorn
+from rich.console import Console
+from starlette.types import ASGIApp
+
+from models import BundleError
+from monitor import Gate, Monitor, MonitorError
+from server.app import MAX_BODY, Lifecycle, create_app
+
+KEY_VARIABLE = "LAGNET_API_KEY"
+"""Environment variable that may hold the key."""
+_IDLE = 75
+"""How long a robot's connection may be idle before it is closed [s]."""
+_LAST_WORDS = 5
+"""How long requests in flight may take once the service has closed its door [s]."""
+
+
+class ServeError(ValueError):
+    """A service that must not be started as asked."""
+
+
+@dataclass(frozen=True)
+class ServeConfig:
+    """Serves a bundle: POST /act, GET /model, /healthz, /readyz.
+
+    When it listens it prints one line of JSON with its url. Ctrl-C or SIGTERM lets it finish what is in
+    flight; a second one stops it at once.
+    """
+
+    bundle: Annotated[Path, tyro.conf.Positional]
+    """The bundle's folder, for example models/NAME."""
+    host: str = "127.0.0.1"
+    """Address to listen on. Beyond loopback a key is required."""
+    port: int = 8000
+    """Port to listen on; 0 takes a free one."""
+    gate: Gate = "risk"
+    """When the filter is active: where the risk score exceeds the threshold, always, never."""
+    threshold: float | None = None
+    """Risk score above which the gate `risk` activates the filter; by default the bundle's."""
+    api_key_file: Path | None = None
+    """File that holds the key; otherwise the environment variable LAGNET_API_KEY."""
+    max_body: int = MAX_BODY
+    """Most bytes of a request's body; more is refused with 413."""
+    max_connections: int = 512
+    """Connections and requests above this are answered 503 at once."""
+    drain_seconds: float = 0.5
+    """How long /readyz says 503 before the service stops accepting connections [s]."""
+
+    def check(self) -> None:
+        """Raises ServeError for what no service can be started with."""
+        if not 0 <= self.port <= 65535:
+            raise ServeError(f"--port must be 0 to 65535, got {self.port}")
+        if self.max_body < 1 or self.max_connections < 1:
+            raise ServeError("--max-body and --max-connections must be at least 1")
+        if not (math.isfinite(self.drain_seconds) and self.drain_seconds >= 0.0):
+            raise ServeError(f"--drain-seconds must be finite and at least 0, got {self.drain_seconds}")
+
+
+class DrainingServer(uvicorn.Server):
+    """A uvicorn server that says "not ready" for a while before it stops accepting connections."""
+
+    def __init__(self, config: uvicorn.Config, lifecycle: Lifecycle, drain_seconds: float) -> None:
+        super().__init__(config)
+        self._lifecycle = lifecycle
+        self._drain_seconds = drain_seconds
+        self._stop_at: float | None = None
+
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        """First signal: drain; second: stop at once. Neither is raised again after the shutdown."""
+        if self._stop_at is not None:
+            self.should_exit = self.force_exit = True
+        self._lifecycle.draining = True
+        self._stop_at = time.monotonic() + self._drain_seconds
+
+    async def on_tick(self, counter: int) -> bool:
+        """Asked ten times a second whether to stop."""
+        if self._stop_at is not None and time.monotonic() >= self._stop_at:
+            self.should_exit = True
+        return await super().on_tick(counter)
+
+
+def listen(host: str, port: int, api_key: str | None) -> socket.socket:
+    """Opens the listening socket.
+
+    Raises:
+        ServeError: if the address cannot be had, or lies beyond loopback and there is no key.
+    """
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(
+            host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+        )[0]
+        if api_key is None and not ipaddress.ip_address(address[0]).is_loopback:
+            raise ServeError(
+                f"{host} can be reached from other machines: set {KEY_VARIABLE} or --api-key-file, "
+                "or listen on 127.0.0.1"
+            )
+        listener = socket.socket(family, kind, protocol)
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind(address)
+        listener.listen()
+    except OSError as error:
+        raise ServeError(f"cannot listen on {host}:{port}: {error.strerror or error}") from error
+    return listener
+
+
+def read_api_key(path: Path | None) -> str | None:
+    """The key from a file, else from the environment, else None.
+
+    Raises:
+        ServeError: if the file cannot be read, or the key is empty or not printable ASCII.
+    """
+    try:
+        key = os.environ.get(KEY_VARIABLE) if path is None else path.read_text(encoding="utf-8").strip()
+    except (OSError, UnicodeDecodeError) as error:
+        raise ServeError(f"--api-key-file {path}: cannot be read: {error}") from error
+    if key is None:
+        return None
+    if not key or not all("!" <= letter <= "~" for letter in key):
+        raise ServeError("the API key must be printable ASCII without spaces, and not empty")
+    return key
+
+
+def serve(config: ServeConfig) -> None:
+    """Serves until told to stop.
+
+    Raises:
+        ServeError: for settings or an address that cannot be had.
+        BundleError: if the bundle must not be used.
+        MonitorError: if it cannot be run with these settings.
+    """
+    config.check()
+    api_key = read_api_key(config.api_key_file)
+    listener = listen(config.host, config.port, api_key)
+    with listener:
+        monitor = Monitor.load(config.bundle, config.gate, config.threshold)
+        lifecycle = Lifecycle()
+        app = create_app(monitor, lifecycle, api_key, config.max_body)
+        host, port = listener.getsockname()[:2]
+        url = f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
+        ready = {"event": "listening", "url": url, "host": host, "port": port, "model": monitor.bundle.id}
+        sys.stdout.write(json.dumps(ready | {"gate": monitor.gate, "threshold": monitor.threshold}) + "\n")
+        sys.stdout.flush()
+        _server(app, lifecycle, config).run(sockets=[listener])
+
+
+def _server(app: ASGIApp, lifecycle: Lifecycle, config: ServeConfig) -> DrainingServer:
+    settings = uvicorn.Config(
+        app,
+        access_log=False,
+        log_level="warning",
+        lifespan="off",
+        ws="none",
+        server_header=False,
+        timeout_keep_alive=_IDLE,
+        limit_concurrency=config.max_connections,
+        timeout_graceful_shutdown=_LAST_WORDS,
+    )
+    return DrainingServer(settings, lifecycle, config.drain_seconds)
+
+
+def main() -> None:
+    """Entry point of `lagnet-serve`: exit status 0 after an orderly stop, 2 if it could not start."""
+    config = tyro.cli(ServeConfig, prog="lagnet-serve")
+    try:
+        serve(config)
+    except (ServeError, BundleError, MonitorError) as error:
+        Console(stderr=True).print(f"lagnet-serve: {error}", style="red", markup=False, soft_wrap=True)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()
