@@ -44,6 +44,7 @@ _FAULTS = (
 )
 """What a decision turns into the safe action. Not `Exception`: a fault nobody thought of must be seen, and
 does not reach the robot as an action either."""
+_ROUNDING = 1e-6
 _ROW_LABELS: dict[int, str | None] = {row: row.name.lower() for row in Row} | {Row.NONE: None}
 
 
@@ -98,9 +99,8 @@ class Monitor:
         self.gate: Gate = gate
         self._networks = networks
         self._filter = action_filter
-        # The graphs clip in float32, whose rounding of a bound may lie outside of the bound.
-        self._low = np.array(bundle.manifest.action_low, np.float32).astype(np.float64)
-        self._high = np.array(bundle.manifest.action_high, np.float32).astype(np.float64)
+        self._low = np.array(bundle.manifest.action_low, np.float64)
+        self._high = np.array(bundle.manifest.action_high, np.float64)
         self._safe = np.clip(np.array(SAFE_ACTION, np.float64), self._low, self._high)
 
     @staticmethod
@@ -203,6 +203,7 @@ class Monitor:
         """Networks, gate, filter; raises on whatever cannot be told apart by robot."""
         self._check_observation(observation)
         nominal, risk = self._networks.run(observation)
+        nominal = self._round_into_bounds(nominal)
         sound = self._within_bounds(nominal) & np.isfinite(risk) & (risk >= 0.0)
         active = self._gate_opens(risk) | ~sound
         asked = np.where(sound[:, None], nominal, self._safe)
@@ -229,6 +230,11 @@ class Monitor:
         if self.gate == "risk":
             return ~(risk <= self.threshold)  # so that NaN opens it
         return np.full(len(risk), self.gate == "always")
+
+    def _round_into_bounds(self, action: FloatArray) -> FloatArray:
+        """Clips what float32 rounded out of the bounds (onnxruntime's tanh reaches 1.0000001); no more."""
+        clipped = np.clip(action, self._low, self._high)
+        return np.where(np.abs(action - clipped) <= _ROUNDING, clipped, action)
 
     def _within_bounds(self, action: FloatArray) -> NDArray[np.bool_]:
         """Whether each action [N, 2] is a number within the bounds; NaN is not."""
