@@ -28,7 +28,7 @@ class PointGoalEnv(gymnasium.Env[FloatArray, FloatArray]):
         render_mode: ``"rgb_array"`` or None.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 50}
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012
 
     def __init__(self, level: int = 1, cost: CostKind = "depth", render_mode: str | None = None) -> None:
         if render_mode not in (None, "rgb_array"):
@@ -88,30 +88,35 @@ class PointGoalEnv(gymnasium.Env[FloatArray, FloatArray]):
         self._cost, self._running = float(result.cost[0]), not (terminated or truncated)
         return result.observation[0], float(result.reward[0]), terminated, truncated, {"cost": self._cost}
 
-    def render(self) -> np.ndarray | None:  # type: ignore[override]
+    def render(self) -> np.ndarray | None:
         """A picture (height, width, 3) uint8 of the present state, or None without a render mode."""
         return None if self.render_mode is None else draw(self.simulation, 0, self._cost)
 
     def hazards_in_body_frame(self) -> FloatArray:
         """(h, 2) centres of the hazards: x ahead of the robot, y to its left [m]."""
-        return self.simulation.hazards_in_body_frame()[0]
+        return _first(self.simulation.hazards_in_body_frame())
 
     @property
     def pose(self) -> FloatArray:
         """(3,) x, y [m], heading [rad] in the world."""
-        return self.simulation.pose[0]
+        return _first(self.simulation.pose)
 
     @property
     def velocity(self) -> FloatArray:
         """(3,) vx, vy [m/s] in the world, yaw rate [rad/s]."""
-        return self.simulation.velocity[0]
+        return _first(self.simulation.velocity)
 
     @property
     def goal(self) -> FloatArray:
         """(2,) centre of the goal [m]."""
-        return self.simulation.goal[0]
+        return _first(self.simulation.goal)
 
     @property
     def hazards(self) -> FloatArray:
         """(h, 2) centres of the hazards [m]."""
-        return self.simulation.hazards[0]
+        return _first(self.simulation.hazards)
+
+
+def _first(rows: FloatArray) -> FloatArray:
+    row: FloatArray = rows[0]
+    return row

@@ -48,7 +48,7 @@ def keepouts(level: int) -> FloatArray:
 
 
 def sample_layout(rng: np.random.Generator, level: int) -> Layout:
-    """Draw a layout: each thing uniform in the extents less its keep-out, in the order robot, goal, hazards, vases.
+    """Draw a layout: robot, goal, hazards, vases in turn, each uniform in the extents less its keep-out.
 
     A thing that finds no valid place in 100 tries starts the layout over. The goal is then drawn once
     more against everything else, as the reference task does.
@@ -114,9 +114,11 @@ def _place(rng: np.random.Generator, order: FloatArray, extent: float) -> FloatA
 
 
 def _first_valid(candidates: FloatArray, placed: FloatArray, squared: FloatArray) -> FloatArray | None:
-    """The first candidate (c, 2) whose squared distances to `placed` (k, 2) are all at least `squared` (k,)."""
+    """The first candidate (c, 2) whose squared distances to `placed` (k, 2) are at least `squared` (k,)."""
     dx = candidates[:, :1] - placed[:, 0]
     dy = candidates[:, 1:] - placed[:, 1]
-    valid = (dx * dx + dy * dy >= squared).all(axis=1)
-    i = int(valid.argmax())
-    return candidates[i] if valid[i] else None
+    valid = np.all(dx * dx + dy * dy >= squared, axis=1)
+    first: FloatArray
+    for first in candidates[valid][:1]:
+        return first
+    return None

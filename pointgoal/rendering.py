@@ -50,7 +50,9 @@ class _Canvas:
                     low = np.array([i, j]) * size
                     self.polygon(low + size * np.array([[0, 0], [1, 0], [1, 1], [0, 1]]), _TILE)
 
-    def disc(self, centre: FloatArray, radius: float, fill: _RGB, opacity: float = 1.0, rim: float = 0.0) -> None:
+    def disc(
+        self, centre: FloatArray, radius: float, fill: _RGB, opacity: float = 1.0, rim: float = 0.0
+    ) -> None:
         """A disc [m]; with a rim, its outline is drawn that wide [m]."""
         ((x, y),) = self._pixel(centre)
         r = radius * self._scale
@@ -100,7 +102,7 @@ def draw(simulation: Simulation, row: int, cost: float) -> np.ndarray:
         yaw = 2 * np.arctan2(vase[6], vase[3])
         canvas.polygon(vase[:2] + _box(0.1, yaw), _VASE, 0.9)
     if cost > 0:
-        canvas.disc(position, 0.32, _COST, 0.25, rim=0.02)
+        canvas.disc(position, 0.32, _COST, 0.15, rim=0.02)
     _draw_robot(canvas, position, heading)
     observation = simulation.observe()[row]
     for name, colour, radius in _LIDAR_RINGS:
@@ -128,11 +130,12 @@ def _draw_lidar(
     angles = heading + (np.arange(LIDAR_BINS) + 0.5) * BIN_WIDTH
     for angle, reading in zip(angles, readings, strict=True):
         dot = position + radius * np.array([np.cos(angle), np.sin(angle)])
-        canvas.disc(dot, 0.018, colour, 0.12 + 0.88 * float(reading))
+        canvas.disc(dot, 0.021, colour, 0.15 + 0.85 * float(reading))
 
 
 def _box(half: float, yaw: float) -> FloatArray:
     """(4, 2) corners of a square around the origin, turned by yaw [rad]."""
     cos, sin = np.cos(yaw), np.sin(yaw)
     corners = half * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-    return corners @ np.array([[cos, sin], [-sin, cos]])
+    turned: FloatArray = corners @ np.array([[cos, sin], [-sin, cos]])
+    return turned

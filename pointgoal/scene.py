@@ -44,7 +44,7 @@ def build_scene(level: int, sleep: bool = True) -> mujoco.MjModel:
     # Contacts solved to the end: stopping at the default 1e-8 moves a sliding vase by what parity can see.
     spec.option.tolerance = 1e-12
     if sleep:
-        # Below the speed at which level 2 begins to charge for a moving vase, so that sleep never hides a cost.
+        # Below the speed at which level 2 charges for a moving vase, so that sleep never hides a cost.
         spec.option.sleep_tolerance = 5e-5
         spec.option.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP
     world = spec.worldbody
@@ -119,4 +119,3 @@ def _add_robot(spec: mujoco.MjSpec) -> None:
         **limits,
     )
     turn.set_to_velocity(kv=1.0)
-

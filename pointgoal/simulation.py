@@ -129,7 +129,9 @@ class Simulation:
     Rows are independent: what a row does depends on its own generator, state and actions alone.
     """
 
-    def __init__(self, level: int, n: int, cost: CostKind = "depth", model: mujoco.MjModel | None = None) -> None:
+    def __init__(
+        self, level: int, n: int, cost: CostKind = "depth", model: mujoco.MjModel | None = None
+    ) -> None:
         if cost not in ("depth", "indicator"):
             raise ValueError(f"cost must be 'depth' or 'indicator', got {cost!r}")
         self.level = level
@@ -138,12 +140,12 @@ class Simulation:
         self.layout = layout(level)
         self.model = build_scene(level) if model is None else model
         self.batch = Batch(self.model, n, nthread=1, persistent=True)
-        self._qpos = self.batch.bind("qpos")
-        self._qvel = self.batch.bind("qvel")
-        self._ctrl = self.batch.bind("ctrl")
-        self._sensors = self.batch.bind("sensordata")
-        self._vase_qpos = self._qpos[:, ROBOT_QPOS:].reshape(n, -1, VASE_QPOS)
-        self._vase_qvel = self._qvel[:, ROBOT_QPOS:].reshape(n, -1, VASE_QVEL)
+        self._qpos: FloatArray = self.batch.bind("qpos")
+        self._qvel: FloatArray = self.batch.bind("qvel")
+        self._ctrl: FloatArray = self.batch.bind("ctrl")
+        self._sensors: FloatArray = self.batch.bind("sensordata")
+        self._vase_qpos: FloatArray = self._qpos[:, ROBOT_QPOS:].reshape(n, -1, VASE_QPOS)
+        self._vase_qvel: FloatArray = self._qvel[:, ROBOT_QPOS:].reshape(n, -1, VASE_QVEL)
         self.elapsed_steps = np.zeros(n, dtype=np.int64)
         self.rngs = [np.random.default_rng() for _ in range(n)]
         # Everything the lidars see, one column a thing: the goal, the hazards, the vases.
@@ -151,7 +153,7 @@ class Simulation:
         self._hazards, self._vases = slice(1, 1 + h), slice(1 + h, 1 + h + m)
         self._x, self._y = np.zeros((n, 1 + h + m)), np.zeros((n, 1 + h + m))
         self._goal_distance = np.zeros(n)
-        # Index of a thing's first lidar number in the flattened observations, for one scatter over rows and kinds.
+        # Index of a thing's first lidar number in the flattened observations: one scatter does all.
         channel = np.repeat([0, 1, 2], [1, h, m])
         rows = np.arange(n)[:, None] * self.layout.size
         self._lidar_start = rows + _SENSOR_NUMBERS + channel * LIDAR_BINS
@@ -213,10 +215,12 @@ class Simulation:
         )
         self.set_state(rows, state)
 
-    def set_state(self, rows: NDArray[np.intp], state: State, elapsed_steps: NDArray[np.int64] | int = 0) -> None:
-        """Put rows (k,) into an exact state (leading axis k), everything awake, at the given step of the episode."""
+    def set_state(
+        self, rows: NDArray[np.intp], state: State, elapsed_steps: NDArray[np.int64] | int = 0
+    ) -> None:
+        """Put rows (k,) into exact states (leading axis k), everything awake, at that step of the episode."""
         k = len(rows)
-        # The reset wakes the vases and clears the solver's warm start, so that nothing of the old episode is left.
+        # The reset wakes the vases and clears the solver's warm start: nothing of the old episode is left.
         self.batch.reset(rows, stage=mujoco.mjtStage.mjSTAGE_NONE)
         self._qpos[rows, :ROBOT_QPOS] = state.pose
         self._qvel[rows, :ROBOT_QPOS] = state.velocity
@@ -260,7 +264,7 @@ class Simulation:
         return self._encode(*self._relative())
 
     def _relative(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """(n, k) world-frame offsets x, y from the robot to everything the lidars see, and their lengths [m]."""
+        """(n, k) world-frame offsets x, y from robot to all that the lidars see, and their lengths [m]."""
         self._x[:, self._vases] = self._vase_qpos[:, :, 0]
         self._y[:, self._vases] = self._vase_qpos[:, :, 1]
         dx = self._x - self._qpos[:, :1]
@@ -269,10 +273,12 @@ class Simulation:
 
     def _cost(self, hazard_distance: FloatArray) -> FloatArray:
         """(n,) cost of the step: depth in hazards, and at level 2 contact with vases and their speed."""
-        cost = np.maximum(HAZARD_RADIUS - hazard_distance, 0.0).sum(axis=1)
+        cost: FloatArray = np.maximum(HAZARD_RADIUS - hazard_distance, 0.0).sum(axis=1)
         if self.level == 2:
             speed = np.linalg.norm(self._vase_qvel[:, :, :3], axis=2)
-            cost += self._sensors[:, _SENSOR_NUMBERS] + np.where(speed >= VASE_SPEED_THRESHOLD, speed, 0).sum(axis=1)
+            cost += self._sensors[:, _SENSOR_NUMBERS] + np.where(speed >= VASE_SPEED_THRESHOLD, speed, 0).sum(
+                axis=1
+            )
         return (cost > 0).astype(np.float64) if self.cost_kind == "indicator" else cost
 
     def _renew_goal(self, row: np.intp) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from gymnasium import spaces
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
 
 from pointgoal.observation import FloatArray, ObservationLayout, layout
 from pointgoal.rendering import draw
@@ -19,7 +21,7 @@ from pointgoal.scene import build_scene
 from pointgoal.simulation import CostKind, Simulation, State, StepResult
 
 
-def observation_space(observation_layout: ObservationLayout) -> spaces.Box:
+def observation_space(observation_layout: ObservationLayout) -> spaces.Space[FloatArray]:
     """Lidar readings are in [0, 1]; the sensors are unbounded."""
     low = np.full(observation_layout.size, -np.inf)
     high = np.full(observation_layout.size, np.inf)
@@ -30,7 +32,7 @@ def observation_space(observation_layout: ObservationLayout) -> spaces.Box:
     return spaces.Box(low, high, dtype=np.float64)
 
 
-def action_space() -> spaces.Box:
+def action_space() -> spaces.Space[FloatArray]:
     """Thrust and turning, in ±1."""
     return spaces.Box(-1.0, 1.0, (2,), dtype=np.float64)
 
@@ -51,7 +53,11 @@ class PointGoalVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
         render_mode: ``"rgb_array"`` or None.
     """
 
-    metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": ["rgb_array"], "render_fps": 50}
+    metadata: dict[str, Any] = {  # noqa: RUF012
+        "autoreset_mode": AutoresetMode.SAME_STEP,
+        "render_modes": ["rgb_array"],
+        "render_fps": 50,
+    }
 
     def __init__(
         self,
@@ -73,7 +79,7 @@ class PointGoalVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
         self.action_space = batch_space(self.single_action_space, num_envs)
         threads = min(num_threads or os.cpu_count() or 1, num_envs)
         bounds = np.linspace(0, num_envs, threads + 1).astype(int)
-        self._slices = [slice(a, b) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
+        self._slices = [slice(a, b) for a, b in pairwise(bounds)]
         model = build_scene(level)
         self.simulations = [Simulation(level, part.stop - part.start, cost, model) for part in self._slices]
         self._pool = ThreadPoolExecutor(threads, "pointgoal") if threads > 1 else None
@@ -87,9 +93,10 @@ class PointGoalVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
 
         Args:
             seed: one number s (row i takes s + i), or one a row, or None to go on with the generators.
-            options: ``"state"``: an exact state (pose, velocity, goal, hazards, vase_qpos, vase_qvel, each with
-                leading axis N); ``"reset_mask"`` (N,) bool: the rows to reset, the others stay as they are;
-                ``"elapsed_steps"`` (N,) int: how far into its episode each row starts, to stagger episodes.
+            options: ``"state"``: an exact state (pose, velocity, goal, hazards, vase_qpos, vase_qvel,
+                each with leading axis N); ``"reset_mask"`` (N,) bool: the rows to reset, the others stay
+                as they are; ``"elapsed_steps"`` (N,) int: how far into its episode each row starts, to
+                stagger episodes.
 
         Returns:
             (N, size) observations, and an info with zero cost.
@@ -104,7 +111,9 @@ class PointGoalVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
             known = ["elapsed_steps", "reset_mask", "state"]
             raise ValueError(f"reset has no options {sorted(options)}; it takes {known}")
         self._seed(seed)
-        chosen = np.ones(self.num_envs, bool) if mask is None else _rows(mask, bool, self.num_envs, "reset_mask")
+        chosen = (
+            np.ones(self.num_envs, bool) if mask is None else _rows(mask, bool, self.num_envs, "reset_mask")
+        )
         if not self._started and not chosen.all():
             raise ValueError("reset_mask: the first reset must start every environment")
         whole = None if state is None else State.from_mapping(state, self.level, self.num_envs)
@@ -123,7 +132,9 @@ class PointGoalVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
         observation = np.concatenate([simulation.observe() for simulation in self.simulations])
         return observation, {"cost": self._cost.copy()}
 
-    def step(self, actions: FloatArray) -> tuple[FloatArray, FloatArray, np.ndarray, np.ndarray, dict[str, Any]]:
+    def step(
+        self, actions: FloatArray
+    ) -> tuple[FloatArray, FloatArray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Advance every environment by 0.02 s.
 
         Args:
@@ -179,27 +190,27 @@ class PointGoalVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
     @property
     def pose(self) -> FloatArray:
         """(N, 3) x, y [m], heading [rad] in the world."""
-        return self._gather("pose")
+        return np.concatenate([simulation.pose for simulation in self.simulations])
 
     @property
     def velocity(self) -> FloatArray:
         """(N, 3) vx, vy [m/s] in the world, yaw rate [rad/s]."""
-        return self._gather("velocity")
+        return np.concatenate([simulation.velocity for simulation in self.simulations])
 
     @property
     def goal(self) -> FloatArray:
         """(N, 2) centres of the goals [m]."""
-        return self._gather("goal")
+        return np.concatenate([simulation.goal for simulation in self.simulations])
 
     @property
     def hazards(self) -> FloatArray:
         """(N, h, 2) centres of the hazards [m]."""
-        return self._gather("hazards")
+        return np.concatenate([simulation.hazards for simulation in self.simulations])
 
     @property
-    def elapsed_steps(self) -> np.ndarray:
+    def elapsed_steps(self) -> NDArray[np.int64]:
         """(N,) steps since the episodes' starts."""
-        return self._gather("elapsed_steps")
+        return np.concatenate([simulation.elapsed_steps for simulation in self.simulations])
 
     def hazards_in_body_frame(self) -> FloatArray:
         """(N, h, 2) centres of the hazards: x ahead of the robot, y to its left [m]."""
@@ -221,9 +232,6 @@ class PointGoalVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
             simulation.load_state_dict({name: array[part] for name, array in state.items()})
         self._cost = state["cost"].copy()
         self._started = True
-
-    def _gather(self, name: str) -> Any:
-        return np.concatenate([getattr(simulation, name) for simulation in self.simulations])
 
     def _seed(self, seed: int | Sequence[int | None] | None) -> None:
         if seed is None and self._started:

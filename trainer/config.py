@@ -75,6 +75,52 @@ class Config:
     multiplier_passes: int = 1
     """lagnet: passes of that ascent over an epoch's states."""
 
+    foresight: float = 0.95
+    """lagnet-foresight: discount γ_f of the future cost that C̄_ξ(s) adds up (0.95: about 0.4 s)."""
+    foresight_init: float = 0.1
+    """lagnet-foresight: the value C̄_ξ(s) starts at in every state."""
+    foresight_learning_rate: float = 1e-3
+    """lagnet-foresight: Adam's step size for the regression of C̄_ξ."""
+    scale_init: float = 200.0
+    """lagnet-foresight: the value the scale β starts at; λ_ξ(s) = β C̄_ξ(s)."""
+    scale_gain: float = 0.05
+    """lagnet-foresight: log β moves by this much an epoch for each relative excess of the cost over d."""
+    scale_step: float = 0.05
+    """lagnet-foresight: largest change of log β in an epoch."""
+    limit_share: float = 1.0
+    """lagnet-foresight: share of the cost limit that β aims at."""
+
+    dual_init: float = 0.001
+    """ppo-lag, trpo-lag, cppo-pid: the value the multiplier (for cppo-pid its integral) starts at."""
+    dual_learning_rate: float = 0.035
+    """ppo-lag, trpo-lag: Adam's step size for the multiplier's ascent."""
+    pid_kp: float = 0.1
+    """cppo-pid: gain of the proportional part."""
+    pid_ki: float = 0.01
+    """cppo-pid: gain of the integral part."""
+    pid_kd: float = 0.01
+    """cppo-pid: gain of the derivative part."""
+    pid_smoothing: float = 0.95
+    """cppo-pid: smoothing of the proportional and the derivative part."""
+    pid_delay: int = 10
+    """cppo-pid: epochs between the two costs of the derivative part."""
+    ipo_form: Literal["log-barrier", "omnisafe"] = "log-barrier"
+    """ipo: the paper's logarithmic barrier, or the penalty that OmniSafe puts in its place."""
+    ipo_sharpness: float = 20.0
+    """ipo: t of the barrier −log(d − J_c) / t (the paper's is 20)."""
+    ipo_kappa: float = 0.01
+    """ipo: κ of OmniSafe's penalty κ / (d − J_c)."""
+    trust_kl: float = 0.01
+    """trpo-lag, cpo, scpo: radius δ of the trust region, as a KL divergence."""
+    cg_iterations: int = 15
+    """trpo-lag, cpo, scpo: iterations of conjugate gradients."""
+    damping: float = 0.1
+    """trpo-lag, cpo, scpo: multiple of the identity added to the Fisher matrix."""
+    fisher_every: int = 4
+    """trpo-lag, cpo, scpo: every how-many-th sample goes into the Fisher products."""
+    cpo_constraint: Literal["episode", "step"] = "episode"
+    """cpo, scpo: unit of the constraint in the step: per episode as in OmniSafe, or per step."""
+
     checkpoint_every: int = 10
     """Epochs between two checkpoints. One is also written at the start, at the end and on Ctrl-C."""
     tensorboard: bool = True
@@ -99,10 +145,15 @@ class Config:
 _POSITIVE = (
     "total_steps", "num_envs", "epoch_steps", "episode_steps", "threads", "passes", "minibatch",
     "learning_rate", "critic_learning_rate", "clip", "kl_stop", "gradient_clip",
-    "multiplier_learning_rate", "multiplier_passes", "checkpoint_every",
+    "multiplier_learning_rate", "multiplier_passes", "checkpoint_every", "foresight_init",
+    "foresight_learning_rate", "scale_init", "scale_step", "limit_share", "dual_learning_rate", "pid_delay",
+    "ipo_sharpness", "ipo_kappa", "trust_kl", "cg_iterations", "fisher_every",
 )  # fmt: skip
-_NOT_NEGATIVE = ("cost_limit", "seed", "entropy", "critic_l2", "multiplier_init")
-_FRACTION = ("discount", "gae")
+_NOT_NEGATIVE = (
+    "cost_limit", "seed", "entropy", "critic_l2", "multiplier_init", "scale_gain", "dual_init", "pid_kp",
+    "pid_ki", "pid_kd", "damping",
+)  # fmt: skip
+_FRACTION = ("discount", "gae", "foresight", "pid_smoothing")
 
 
 def check(config: Config) -> None:

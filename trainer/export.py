@@ -20,7 +20,8 @@ from rich.console import Console
 from models import BundleError, Manifest, ObservationBlock, write_bundle
 from pointgoal.observation import HAZARD_RADIUS, layout
 from trainer import checkpoint, onnx_graph
-from trainer.algorithms import Algorithm, build
+from trainer.algorithms import ALGORITHMS
+from trainer.algorithms.base import Algorithm
 from trainer.calibration import Threshold, calibrate
 from trainer.closed_loop import Episodes, episodes
 from trainer.errors import CheckpointError, ExportError, TrainerError
@@ -78,7 +79,7 @@ class TrainedRun:
             inputs = state["normaliser.mean"].shape[0]
             rng = np.random.default_rng(0)
             self.learner = Learner(self.config, inputs, len(facts["action_low"]), rng)
-            self.algorithm: Algorithm = build(self.config.algorithm, self.learner)
+            self.algorithm: Algorithm = ALGORITHMS[self.config.algorithm](self.learner)
             self.learner.load_state_dict(state)
             self.algorithm.load_state(facts["algorithm"])
             self.steps = int(facts["epoch"]) * self.config.epoch_steps

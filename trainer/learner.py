@@ -106,12 +106,12 @@ class Learner:
         """Reward and cost values [2, B] of normalised observations [B, n]."""
         return stacked(self.critics, observation, self.critic_shape)
 
-    def batch(self, trajectory: Trajectory, cost_discount: float | None = None) -> Batch:
+    def batch(self, trajectory: Trajectory, cost_discount: float) -> Batch:
         """Turns a trajectory into samples with advantages and targets.
 
         Args:
             trajectory: one epoch.
-            cost_discount: γ of the cost if it differs from the reward's.
+            cost_discount: γ of the cost.
 
         Returns:
             The batch.
@@ -123,8 +123,8 @@ class Learner:
             if not np.isfinite(getattr(trajectory, name)).all():
                 raise NonFiniteError(f"the environment returned a {name} that is not finite")
         T, N = trajectory.reward.shape
-        seen = self._normalised(trajectory.observation)
-        final = self._normalised(trajectory.final_observation)
+        seen = self.normalised(trajectory.observation)
+        final = self.normalised(trajectory.final_observation)
         with torch.no_grad():
             values = self.values(seen).view(2, T + 1, N).numpy()
             final_values = self.values(final).numpy()
@@ -132,7 +132,7 @@ class Learner:
         advantages, targets = [], []
         for k, signal, discount in (
             (REWARD, trajectory.reward, config.discount),
-            (COST, trajectory.cost, config.discount if cost_discount is None else cost_discount),
+            (COST, trajectory.cost, cost_discount),
         ):
             after = successor_values(values[k], trajectory.ended, trajectory.terminated, final_values[k])
             advantage = gae(signal, values[k], after, trajectory.ended, discount, config.gae)
@@ -154,7 +154,8 @@ class Learner:
             trajectory=trajectory,
         )
 
-    def _normalised(self, observation: npt.NDArray[np.float32]) -> Tensor:
+    def normalised(self, observation: npt.NDArray[np.float32]) -> Tensor:
+        """Raw observations [..., n] → normalised tensor [B, n]."""
         return _flat(self.normaliser(observation))
 
     def state_dict(self) -> dict[str, npt.NDArray[Any]]:

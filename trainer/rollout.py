@@ -50,7 +50,8 @@ class Figures:
 
     Attributes:
         returns: return of each of the last 500 episodes.
-        costs: cost of each of them.
+        costs: cost of each of them, as the task has it.
+        constrained: what the algorithm constrains in each of them; differs from the cost under SCPO.
         lengths: steps of each of them.
         total: episodes ended since the run began.
         fresh: how many of them ended in the latest epoch.
@@ -59,15 +60,16 @@ class Figures:
 
     returns: deque[float] = field(default_factory=lambda: deque(maxlen=TAIL))
     costs: deque[float] = field(default_factory=lambda: deque(maxlen=TAIL))
-    lengths: deque[int] = field(default_factory=lambda: deque(maxlen=TAIL))
+    constrained: deque[float] = field(default_factory=lambda: deque(maxlen=TAIL))
+    lengths: deque[float] = field(default_factory=lambda: deque(maxlen=TAIL))
     total: int = 0
     fresh: int = 0
     step_cost: float = 0.0
 
     @property
     def episode_cost(self) -> float | None:
-        """J_c: mean cost of the last 100 episodes, None before the first one has ended."""
-        return mean(list(self.costs)[-RECENT:])
+        """J_c: mean constrained cost of the last 100 episodes, None before the first one has ended."""
+        return mean(list(self.constrained)[-RECENT:])
 
 
 def mean(values: list[float]) -> float | None:
@@ -102,7 +104,8 @@ class Rollout:
         self._observation = np.asarray(observation, np.float32)
         self._return = np.zeros(env.num_envs)
         self._cost = np.zeros(env.num_envs)
-        self._length = np.zeros(env.num_envs, np.int64)
+        self._constrained = np.zeros(env.num_envs)
+        self._length = np.zeros(env.num_envs)
         self._whole = elapsed == 0
 
     def collect(self, actor: Floats, shape: Shape, normaliser: Normaliser) -> Trajectory:
@@ -148,6 +151,7 @@ class Rollout:
             ended = terminated | truncated
             self._return += reward
             self._cost += info.get("task_cost", info["cost"])
+            self._constrained += info["cost"]
             self._length += 1
             if ended.any():
                 out.ended[t], out.terminated[t] = ended, terminated
@@ -164,11 +168,13 @@ class Rollout:
         for i in np.flatnonzero(ended & self._whole):
             self.figures.returns.append(float(self._return[i]))
             self.figures.costs.append(float(self._cost[i]))
-            self.figures.lengths.append(int(self._length[i]))
+            self.figures.constrained.append(float(self._constrained[i]))
+            self.figures.lengths.append(float(self._length[i]))
             self.figures.total += 1
         self._return[ended] = 0.0
         self._cost[ended] = 0.0
-        self._length[ended] = 0
+        self._constrained[ended] = 0.0
+        self._length[ended] = 0.0
         self._whole[ended] = True
 
     def state_dict(self) -> dict[str, npt.NDArray[Any]]:
@@ -180,11 +186,13 @@ class Rollout:
             "observation": self._observation,
             "return": self._return,
             "cost": self._cost,
+            "constrained": self._constrained,
             "length": self._length,
             "whole": self._whole,
             "figures.returns": np.asarray(figures.returns, np.float64),
             "figures.costs": np.asarray(figures.costs, np.float64),
-            "figures.lengths": np.asarray(figures.lengths, np.int64),
+            "figures.constrained": np.asarray(figures.constrained, np.float64),
+            "figures.lengths": np.asarray(figures.lengths, np.float64),
             "figures.total": np.asarray(figures.total, np.int64),
         }
 
@@ -195,11 +203,13 @@ class Rollout:
         self._observation = state["observation"].copy()
         self._return = state["return"].copy()
         self._cost = state["cost"].copy()
+        self._constrained = state["constrained"].copy()
         self._length = state["length"].copy()
         self._whole = state["whole"].copy()
         self.figures = Figures(
             returns=deque(state["figures.returns"].tolist(), maxlen=TAIL),
             costs=deque(state["figures.costs"].tolist(), maxlen=TAIL),
+            constrained=deque(state["figures.constrained"].tolist(), maxlen=TAIL),
             lengths=deque(state["figures.lengths"].tolist(), maxlen=TAIL),
             total=int(state["figures.total"]),
         )

@@ -19,7 +19,8 @@ from gymnasium.vector import VectorEnv
 from rich.console import Console
 
 from trainer import checkpoint
-from trainer.algorithms import Algorithm, build
+from trainer.algorithms import ALGORITHMS, prepare_environments
+from trainer.algorithms.base import Algorithm
 from trainer.config import Config, check
 from trainer.errors import CheckpointError, ConfigError, TrainerError
 from trainer.learner import Learner
@@ -75,10 +76,10 @@ class Run:
         self.config = config
         self.folder = folder
         self.rng = np.random.default_rng(config.seed)
-        observation: Any = env.single_observation_space
+        space: Any = env.single_observation_space
         self.bounds: Any = env.single_action_space
-        self.learner = Learner(config, observation.shape[0], self.bounds.shape[0], self.rng)
-        self.algorithm: Algorithm = build(config.algorithm, self.learner)
+        self.learner = Learner(config, space.shape[0], self.bounds.shape[0], self.rng)
+        self.algorithm: Algorithm = ALGORITHMS[config.algorithm](self.learner)
         self.rollout = Rollout(env, config.horizon, config.episode_steps, config.seed, self.rng)
         self.epoch = 0
 
@@ -98,7 +99,8 @@ class Run:
         actor = learner.actor.detach().numpy()
         trajectory = rollout.collect(actor, learner.actor_shape, learner.normaliser)
         figures = rollout.figures
-        logged = self.algorithm.update(learner.batch(trajectory), figures)
+        batch = learner.batch(trajectory, self.algorithm.cost_discount)
+        logged = self.algorithm.update(batch, figures)
         seen = trajectory.observation[:-1]
         learner.normaliser.update(seen.reshape(-1, seen.shape[-1]))
         self.epoch += 1
@@ -110,9 +112,9 @@ class Run:
             "episodes_ended": fresh,
             "return": mean(list(figures.returns)[-fresh:] if fresh else []),
             "cost": mean(list(figures.costs)[-fresh:] if fresh else []),
-            "length": mean([float(n) for n in list(figures.lengths)[-fresh:]] if fresh else []),
+            "length": mean(list(figures.lengths)[-fresh:] if fresh else []),
             "return_100": mean(list(figures.returns)[-100:]),
-            "cost_100": figures.episode_cost,
+            "cost_100": mean(list(figures.costs)[-100:]),
             "step_cost": figures.step_cost,
             "action_std": float(np.exp(actor[learner.actor_shape.size :]).mean()),
             **logged,
@@ -182,7 +184,7 @@ def train(
     started = perf_counter()
     config, folder, resumed = prepare(config)
     torch.set_num_threads(config.threads)
-    with closing(make(config)) as env:
+    with closing(prepare_environments(config.algorithm, make(config))) as env:
         run = Run(config, folder, env)
         length = run.load() if resumed and (folder / checkpoint.FILE).exists() else 0
         table = ProgressFile(folder, length)

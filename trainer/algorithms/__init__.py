@@ -1,32 +1,33 @@
-"""The algorithms by name. Each is a class with `update`, `state` and `load_state`."""
+"""The algorithms by name."""
 
-from collections.abc import Callable
-from typing import Protocol
+from typing import Any
 
+from gymnasium.vector import VectorEnv
+
+from trainer.algorithms.base import Algorithm
+from trainer.algorithms.cpo import CPO
+from trainer.algorithms.cppo_pid import CPPOPid
+from trainer.algorithms.ipo import IPO
 from trainer.algorithms.lagnet import Lagnet
-from trainer.algorithms.multiplier import MultiplierNetwork
+from trainer.algorithms.lagnet_foresight import LagnetForesight
 from trainer.algorithms.ppo import PPO
-from trainer.learner import Batch, Learner
-from trainer.rollout import Figures
+from trainer.algorithms.ppo_lag import PPOLag
+from trainer.algorithms.scpo import SCPO, MaximumCost
+from trainer.algorithms.trpo_lag import TRPOLag
+
+ALGORITHMS: dict[str, type[Algorithm]] = {
+    "ppo": PPO,
+    "ppo-lag": PPOLag,
+    "trpo-lag": TRPOLag,
+    "cppo-pid": CPPOPid,
+    "ipo": IPO,
+    "cpo": CPO,
+    "scpo": SCPO,
+    "lagnet": Lagnet,
+    "lagnet-foresight": LagnetForesight,
+}
 
 
-class Algorithm(Protocol):
-    """What the training loop asks of an algorithm."""
-
-    def update(self, batch: Batch, figures: Figures) -> dict[str, float]:
-        """One update on one epoch; returns the figures to log."""
-
-    def multiplier_network(self) -> MultiplierNetwork | None:
-        """λ_ξ, if the algorithm learns one."""
-
-    def state(self) -> dict[str, float | list[float]]:
-        """What a checkpoint must keep beside the learner's tensors."""
-
-    def load_state(self, state: dict[str, float | list[float]]) -> None:
-        """Takes on what state returned."""
-
-
-def build(name: str, learner: Learner) -> Algorithm:
-    """The algorithm of that name, on that learner."""
-    algorithms: dict[str, Callable[[Learner], Algorithm]] = {"ppo": PPO, "lagnet": Lagnet}
-    return algorithms[name](learner)
+def prepare_environments(algorithm: str, env: VectorEnv[Any, Any, Any]) -> VectorEnv[Any, Any, Any]:
+    """The vector environment as the algorithm wants to see it."""
+    return MaximumCost(env) if algorithm == "scpo" else env

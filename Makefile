@@ -1,0 +1,42 @@
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+BUNDLE ?= models/pointgoal1
+
+.PHONY: help setup demo test lint format benchmark clean
+
+help: ## what can be made
+	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
+
+setup: $(VENV)/.installed ## install everything into .venv
+
+# One stamp for the whole installation: made anew when what is installed changes.
+$(VENV)/.installed: pyproject.toml constraints.txt
+	$(PYTHON) -c 'import sys; sys.exit("Python 3.11 or newer is needed, this is " + sys.version.split()[0] if sys.version_info < (3, 11) else 0)'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[train,sweep,test]'
+	touch $@
+
+demo: setup ## the robot in MuJoCo, driven through POST /act, with and without the filter
+	$(BIN)/python -m evaluation.demo $(BUNDLE) --out demo
+
+test: setup ## the whole test suite
+	$(BIN)/python -m pytest
+
+lint: setup ## ruff and mypy, as CI runs them
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: setup ## let ruff rewrite the code
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+benchmark: setup ## every measurement, one after the other
+	$(BIN)/python -m benchmarks.simulation
+	$(BIN)/python -m benchmarks.training
+	$(BIN)/python -m benchmarks.filter
+	$(BIN)/python -m benchmarks.server
+
+clean: ## remove what make made
+	rm -rf $(VENV) demo build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis

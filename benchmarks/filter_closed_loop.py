@@ -1,0 +1,283 @@
+"""The filter in the closed loop: violations and return, by policy, source of the hazards, and what is off.
+
+``python -m benchmarks.filter_closed_loop --episodes 1000`` prints the tables of docs/filter.md. Every episode is a
+fresh layout; all run side by side in the vector environment, the filter in one batch.
+"""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import tyro
+from numpy.typing import NDArray
+
+from filter import BarrierFilter, FilterConfig, FilterMemory
+from pointgoal.observation import BIN_WIDTH, LIDAR_BINS, LIDAR_RANGE, layout
+
+FloatArray = NDArray[np.float64]
+Policy = Callable[[FloatArray, FloatArray, np.random.Generator], FloatArray]
+"""Observation (N, 60) and hazards in the body frame (N, n, 2) -> actions (N, 2)."""
+EPISODE_STEPS = 1000
+
+
+@dataclass(frozen=True)
+class Off:
+    """What is off in the world that the filter does not know of.
+
+    Attributes:
+        mass, drag, thrust, turning: factors on the robot's own.
+        distance: bound on the error of a hazard's distance [m].
+        bearing: bound on the error of its bearing [rad].
+        speed: bound on the relative error of the measured velocities.
+        gaussian: whether the bounds are standard deviations of normal errors instead.
+    """
+
+    mass: float = 1.0
+    drag: float = 1.0
+    thrust: float = 1.0
+    turning: float = 1.0
+    distance: float = 0.0
+    bearing: float = 0.0
+    speed: float = 0.0
+    gaussian: bool = False
+
+
+@dataclass
+class Outcome:
+    """What E episodes gave.
+
+    Attributes:
+        returns: (E,) undiscounted.
+        costs: (E,).
+        violations: (E,) steps with a cost.
+        interventions: share of the steps on which the action was changed.
+        fallbacks: share of the steps on which nothing was certified.
+        least: least distance of the robot to a hazard's edge [m].
+        seconds: wall time of the filter a decision.
+    """
+
+    returns: FloatArray
+    costs: FloatArray
+    violations: NDArray[np.int64]
+    interventions: float
+    fallbacks: float
+    least: float
+    seconds: float
+
+
+def random_policy(observation: FloatArray, hazards: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Uniformly random actions."""
+    return rng.uniform(-1.0, 1.0, (len(observation), 2))
+
+
+def thrust_policy(observation: FloatArray, hazards: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Full thrust always, straight ahead."""
+    return np.tile([1.0, 0.0], (len(observation), 1))
+
+
+def _steer(target: FloatArray) -> FloatArray:
+    bearing = np.arctan2(target[:, 1], target[:, 0])
+    return np.stack([np.ones(len(target)), np.clip(4.0 * bearing, -1.0, 1.0)], axis=1)
+
+
+def attacker_policy(observation: FloatArray, hazards: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Full thrust, steering at the nearest hazard."""
+    nearest = np.hypot(hazards[..., 0], hazards[..., 1]).argmin(axis=1)
+    return _steer(hazards[np.arange(len(hazards)), nearest])
+
+
+def seeker_policy(observation: FloatArray, hazards: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Steer the velocity at the goal, blind to hazards: a policy by hand that needs no training."""
+    goal = goal_from_lidar(observation)
+    stop = 0.519 * observation[:, 3:5]
+    ahead = goal - 0.5 * stop
+    lost = ~np.isfinite(goal[:, 0])
+    ahead[lost] = [1.0, 0.0]
+    action = _steer(ahead)
+    bearing = np.abs(np.arctan2(ahead[:, 1], ahead[:, 0]))
+    action[:, 0] = np.where(bearing < 1.0, 1.0, np.where(bearing > 2.0, -1.0, 0.0))
+    return action
+
+
+def goal_from_lidar(observation: FloatArray) -> FloatArray:
+    """The goal's centre (N, 2) in the body frame [m]; NaN beyond the lidar's range."""
+    readings = observation[:, layout(1).slice("goal_lidar")]
+    rows = np.arange(len(readings))
+    best = readings.argmax(axis=1)
+    strongest = readings[rows, best]
+    after = readings[rows, (best + 1) % LIDAR_BINS]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        share = after / strongest
+    bearing = (best + share) * BIN_WIDTH
+    distance = np.where(strongest > 0.0, LIDAR_RANGE * (1.0 - strongest), np.nan)
+    return np.stack([distance * np.cos(bearing), distance * np.sin(bearing)], axis=1)
+
+
+def bundle_policy(path: Path) -> Policy:
+    """The policy of a bundle, deterministic."""
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    session = onnxruntime.InferenceSession(str(path / "policy.onnx"), options)
+
+    def act(observation: FloatArray, hazards: FloatArray, rng: np.random.Generator) -> FloatArray:
+        (action,) = session.run(["action"], {"observation": observation.astype(np.float32)})
+        return np.asarray(action, dtype=np.float64)
+
+    return act
+
+
+def make_environments(level: int, n: int, off: Sequence[Off]) -> Any:
+    """N environments, in which the rows take the robots of ``off`` in turn, in equal shares."""
+    from pointgoal.scene import build_scene
+    from pointgoal.simulation import Simulation
+    from pointgoal.vector import PointGoalVectorEnv
+
+    env = PointGoalVectorEnv(level=level, num_envs=n, num_threads=len(off))
+    for part, one in zip(env._slices, off, strict=True):
+        model = build_scene(level)
+        robot = model.body("robot").id
+        model.body_mass[robot] *= one.mass
+        model.body_inertia[robot] *= one.mass
+        model.dof_damping[:2] *= one.drag
+        model.actuator_gear[0] *= one.thrust
+        model.actuator_gear[1] *= one.turning
+        env.simulations[env._slices.index(part)] = Simulation(level, part.stop - part.start, "depth", model)
+    return env
+
+
+def _perturbed(
+    observation: FloatArray, hazards: FloatArray, off: Off, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """What faulty sensors show: observation (N, 60), its hazard lidar made anew, and hazards (N, n, 2)."""
+
+    def error(bound: float, shape: tuple[int, ...]) -> FloatArray:
+        return rng.normal(0.0, bound, shape) if off.gaussian else rng.uniform(-bound, bound, shape)
+
+    observation = observation.copy()
+    distance = np.hypot(hazards[..., 0], hazards[..., 1])
+    bearing = np.arctan2(hazards[..., 1], hazards[..., 0]) + error(off.bearing, distance.shape)
+    distance = np.maximum(distance + error(off.distance, distance.shape), 0.0)
+    shown = np.stack([distance * np.cos(bearing), distance * np.sin(bearing)], axis=-1)
+    motion = slice(layout(1).slice("velocimeter").start, layout(1).slice("gyro").stop)
+    observation[:, motion] *= 1.0 + error(off.speed, observation[:, motion].shape)
+    observation[:, layout(1).slice("hazards_lidar")] = lidar(shown)
+    return observation, shown
+
+
+def lidar(centres: FloatArray) -> FloatArray:
+    """The pseudo-lidar (N, 16) of things at (N, n, 2) in the body frame [m]."""
+    n = len(centres)
+    readings = np.zeros((n, LIDAR_BINS))
+    reading = np.maximum(LIDAR_RANGE - np.hypot(centres[..., 0], centres[..., 1]), 0.0) / LIDAR_RANGE
+    place = np.remainder(np.arctan2(centres[..., 1], centres[..., 0]) / BIN_WIDTH, LIDAR_BINS)
+    whole = place.astype(np.int64)
+    share = place - whole
+    rows = np.arange(n)[:, None]
+    np.maximum.at(readings, (rows, whole % LIDAR_BINS), reading)
+    np.maximum.at(readings, (rows, (whole + 1) % LIDAR_BINS), share * reading)
+    np.maximum.at(readings, (rows, (whole - 1) % LIDAR_BINS), (1.0 - share) * reading)
+    return readings
+
+
+def run(
+    policy: Policy,
+    robot_filter: BarrierFilter | None,
+    source: Literal["given", "lidar"],
+    episodes: int,
+    level: int = 1,
+    off: Sequence[Off] = (Off(),),
+    seed: int = 1_000_000,
+    with_memory: bool = True,
+    chunk: int = 512,
+) -> Outcome:
+    """Run episodes of one policy behind one filter."""
+    outcomes = [
+        _run(policy, robot_filter, source, min(chunk, episodes - i), level, off, seed + i, with_memory)
+        for i in range(0, episodes, chunk)
+    ]
+    return Outcome(
+        returns=np.concatenate([one.returns for one in outcomes]),
+        costs=np.concatenate([one.costs for one in outcomes]),
+        violations=np.concatenate([one.violations for one in outcomes]),
+        interventions=float(np.mean([one.interventions for one in outcomes])),
+        fallbacks=float(np.mean([one.fallbacks for one in outcomes])),
+        least=min(one.least for one in outcomes),
+        seconds=float(np.mean([one.seconds for one in outcomes])),
+    )
+
+
+def _run(
+    policy: Policy,
+    robot_filter: BarrierFilter | None,
+    source: str,
+    n: int,
+    level: int,
+    off: Sequence[Off],
+    seed: int,
+    with_memory: bool,
+) -> Outcome:
+    env = make_environments(level, n, off)
+    rng = np.random.default_rng(seed)
+    observation, _ = env.reset(seed=seed)
+    returns, costs = np.zeros(n), np.zeros(n)
+    violations = np.zeros(n, dtype=np.int64)
+    alive = np.ones(n, dtype=bool)
+    changed = fallen = 0
+    least = np.inf
+    spent = 0.0
+    memory = FilterMemory.empty(n)
+    noisy = off[0].distance + off[0].bearing + off[0].speed > 0.0
+    for _ in range(EPISODE_STEPS):
+        hazards = env.hazards_in_body_frame()
+        seen, shown = _perturbed(observation, hazards, off[0], rng) if noisy else (observation, hazards)
+        action = policy(seen, shown, rng)
+        if robot_filter is not None:
+            start = time.perf_counter()
+            result = robot_filter.filter(
+                seen, action, shown if source == "given" else None, memory if with_memory else None
+            )
+            spent += time.perf_counter() - start
+            memory = result.memory
+            action = result.action
+            changed += int((result.mode[alive] > 0).sum())
+            fallen += int((result.mode[alive] == 2).sum())
+        observation, reward, terminated, truncated, info = env.step(action)
+        returns[alive] += reward[alive]
+        costs[alive] += info["cost"][alive]
+        violations[alive] += _hazard_violations(info, alive, level, env)
+        if level > 0:
+            distance = np.linalg.norm(env.hazards_in_body_frame(), axis=2)
+            done = terminated | truncated
+            least = min(least, float(distance[alive & ~done].min(initial=np.inf)) - 0.2)
+        alive &= ~(terminated | truncated)
+        if not alive.any():
+            break
+    env.close()
+    steps = n * EPISODE_STEPS
+    return Outcome(returns, costs, violations, changed / steps, fallen / steps, least, spent / steps)
+
+
+def _hazard_violations(
+    info: dict[str, Any], alive: NDArray[np.bool_], level: int, env: Any
+) -> NDArray[np.int64]:
+    """Steps with a cost; at level 2, where vases cost as well, steps inside a hazard."""
+    if level == 2:
+        inside = np.linalg.norm(env.hazards_in_body_frame(), axis=2).min(axis=1) < 0.2
+        return (inside & alive)[alive].astype(np.int64)
+    return (info["cost"][alive] > 0.0).astype(np.int64)
+
+
+POLICIES: dict[str, Policy] = {
+    "random": random_policy,
+    "thrust": thrust_policy,
+    "attacker": attacker_policy,
+    "seeker": seeker_policy,
+}

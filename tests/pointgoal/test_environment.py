@@ -1,0 +1,220 @@
+"""The single and the vector environment: gymnasium's rules, exact states, seeds, resets, saved states."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import warnings
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pointgoal.environment import PointGoalEnv
+from pointgoal.observation import BIN_WIDTH, LIDAR_BINS, LIDAR_RANGE, layout
+from pointgoal.vector import PointGoalVectorEnv
+
+IDS = [f"PointGoal{level}-v0" for level in (0, 1, 2)]
+
+
+def exact_state(n: int | None = None, **changes: Any) -> dict[str, np.ndarray]:
+    """A robot at rest in the origin, its goal 2 m ahead and everything else far away."""
+    state = {
+        "pose": np.zeros(3),
+        "velocity": np.zeros(3),
+        "goal": np.array([2.0, 0.0]),
+        "hazards": np.full((8, 2), 20.0),
+        "vase_qpos": np.array([[9.0, 9.0, 0.09996, 1.0, 0.0, 0.0, 0.0]]),
+        "vase_qvel": np.zeros((1, 6)),
+        **{name: np.asarray(value, float) for name, value in changes.items()},
+    }
+    return state if n is None else {name: np.repeat(array[None], n, axis=0) for name, array in state.items()}
+
+
+@pytest.mark.parametrize("name", IDS)
+def test_gymnasium_accepts_the_environment(name: str) -> None:
+    with warnings.catch_warnings():
+        # Unbounded sensors are the task's; everything else that the checker warns of is a defect.
+        warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", message=".*(minimum|maximum) value is -?infinity.*")
+        check_env(gymnasium.make(name, render_mode="rgb_array").unwrapped)
+
+
+def run(program: str) -> str:
+    command = [sys.executable, "-W", "ignore", "-c", program]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
+
+def test_the_installed_entry_point_registers() -> None:
+    load = "from importlib.metadata import entry_points as e; e(group='gymnasium.envs')['pointgoal'].load()()"
+    make = "import gymnasium; print(gymnasium.make('PointGoal1-v0').observation_space.shape)"
+    assert run(f"{load}; {make}") == "(60,)"
+
+
+def test_gymnasium_imports_the_package_by_its_name() -> None:
+    # Gymnasium 1.0 gave its plug-in loader up for this form.
+    make = "import gymnasium; print(gymnasium.make('pointgoal:PointGoal0-v0').observation_space.shape)"
+    assert run(make) == "(28,)"
+
+
+@pytest.mark.parametrize("name", IDS)
+def test_vector_row_is_the_single_environment(name: str) -> None:
+    n, row, seed = 5, 3, 11
+    many, single = gymnasium.make_vec(name, num_envs=n), gymnasium.make(name)
+    observations, _ = many.reset(seed=seed)
+    observation, _ = single.reset(seed=seed + row)
+    np.testing.assert_array_equal(observations[row], observation)
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        actions = rng.uniform(-1, 1, (n, 2))
+        observations, rewards, _, _, infos = many.step(actions)
+        observation, reward, _, _, info = single.step(actions[row])
+        np.testing.assert_array_equal(observations[row], observation)
+        assert (rewards[row], infos["cost"][row]) == (reward, info["cost"])
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3])
+def test_threads_change_nothing(threads: int) -> None:
+    runs = []
+    for number in (1, threads):
+        env = PointGoalVectorEnv(level=1, num_envs=7, num_threads=number)
+        env.reset(seed=4)
+        rng = np.random.default_rng(1)
+        runs.append(np.array([env.step(rng.uniform(-1, 1, (7, 2)))[0] for _ in range(60)]))
+        env.close()
+    np.testing.assert_array_equal(*runs)
+
+
+def test_an_episode_ends_after_1000_steps_and_starts_anew_in_the_same_step() -> None:
+    env = PointGoalVectorEnv(level=1, num_envs=3)
+    env.reset(seed=0, options={"elapsed_steps": [0, 998, 999]})
+    _, _, _, truncated, info = env.step(np.zeros((3, 2)))
+    assert truncated.tolist() == [False, False, True]
+    assert info["_final_obs"].tolist() == [False, False, True]
+    observation, _, _, truncated, info = env.step(np.zeros((3, 2)))
+    assert truncated.tolist() == [False, True, False]
+    assert (info["final_obs"][1] != observation[1]).any()
+    assert env.elapsed_steps.tolist() == [2, 0, 1]
+
+
+def test_reset_mask_leaves_the_others_alone() -> None:
+    env = PointGoalVectorEnv(level=1, num_envs=4, num_threads=2)
+    env.reset(seed=0)
+    for _ in range(5):
+        before, *_ = env.step(np.ones((4, 2)))
+    mask = np.array([False, True, False, True])
+    after, _ = env.reset(options={"state": exact_state(4, pose=[0.5, 0.0, 0.0]), "reset_mask": mask})
+    np.testing.assert_array_equal(after[~mask, 3:], before[~mask, 3:])
+    np.testing.assert_array_equal(env.pose[mask], [[0.5, 0.0, 0.0]] * 2)
+    assert env.elapsed_steps.tolist() == [5, 0, 5, 0]
+
+
+@pytest.mark.parametrize("level", [1, 2])
+def test_a_loaded_state_goes_on_bit_for_bit(level: int) -> None:
+    n = 6
+    env = PointGoalVectorEnv(level=level, num_envs=n)
+    env.reset(seed=2, options={"elapsed_steps": np.arange(n) * 180})
+    actions = np.random.default_rng(3).uniform(-1, 1, (200, n, 2))
+    for action in actions[:80]:
+        env.step(action)
+    state = {name: array.copy() for name, array in env.state_dict().items()}
+    other = PointGoalVectorEnv(level=level, num_envs=n)
+    other.load_state_dict(state)
+    for action in actions[80:]:
+        for ours, theirs in zip(env.step(action)[:4], other.step(action)[:4], strict=True):
+            np.testing.assert_array_equal(ours, theirs)
+    with pytest.raises(ValueError, match="physics"):
+        PointGoalVectorEnv(level=level, num_envs=n + 1).load_state_dict(state)
+
+
+def test_costs() -> None:
+    deep = exact_state(hazards=np.vstack([[[0.05, 0.0], [0.0, -0.1]], np.full((6, 2), 9.0)]))
+    for kind, expected in (("depth", 0.15 + 0.1), ("indicator", 1.0)):
+        env = gymnasium.make("PointGoal1-v0", cost=kind)
+        _, info = env.reset(options={"state": deep})
+        assert info["cost"] == 0.0
+        assert env.step(np.zeros(2))[4]["cost"] == pytest.approx(expected, abs=1e-12)
+    with pytest.raises(ValueError, match="cost must be"):
+        gymnasium.make("PointGoal1-v0", cost="deep")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"state": {"pose": np.zeros(3)}}, "lacks 'velocity'"),
+        ({"state": exact_state() | {"goal": np.zeros(3)}}, r"'goal' has shape \(1, 3\)"),
+        ({"state": exact_state() | {"colour": np.zeros(3)}}, "unknown fields"),
+        ({"state": exact_state() | {"pose": np.array([0, np.nan, 0])}}, "'pose' is not finite"),
+        ({"start": 1}, "no options"),
+    ],
+)
+def test_a_bad_reset_names_the_field(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        gymnasium.make("PointGoal1-v0").unwrapped.reset(options=options)
+
+
+def test_bad_actions_are_refused() -> None:
+    env = PointGoalVectorEnv(level=1, num_envs=2)
+    with pytest.raises(RuntimeError, match="before reset"):
+        env.step(np.zeros((2, 2)))
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="shape"):
+        env.step(np.zeros((3, 2)))
+    with pytest.raises(ValueError, match="finite"):
+        env.step(np.full((2, 2), np.nan))
+
+
+def plain_lidar(points: np.ndarray) -> np.ndarray:
+    """Readings (16,) for body-frame points (k, 2), one point at a time, from the task's definition."""
+    readings = np.zeros(LIDAR_BINS)
+    for x, y in points:
+        angle = np.arctan2(y, x) % (2 * np.pi)
+        bin_, alias = int(angle / BIN_WIDTH) % LIDAR_BINS, angle / BIN_WIDTH % 1
+        reading = max(0.0, LIDAR_RANGE - np.hypot(x, y)) / LIDAR_RANGE
+        for index, value in ((bin_, reading), (bin_ + 1, alias * reading), (bin_ - 1, (1 - alias) * reading)):
+            readings[index % LIDAR_BINS] = max(readings[index % LIDAR_BINS], value)
+    return readings
+
+
+lidar_environment = PointGoalEnv(level=1)
+coordinate = st.floats(-3, 3, allow_nan=False)
+
+
+@given(
+    pose=st.tuples(coordinate, coordinate, st.floats(-40, 40)),
+    hazards=st.lists(st.tuples(coordinate, coordinate), min_size=8, max_size=8),
+)
+@settings(max_examples=100, deadline=None)
+def test_lidar_follows_its_definition(pose: tuple[float, ...], hazards: list[tuple[float, float]]) -> None:
+    observation, _ = lidar_environment.reset(options={"state": exact_state(pose=pose, hazards=hazards)})
+    readings = observation[layout(1).slice("hazards_lidar")]
+    np.testing.assert_allclose(readings, plain_lidar(lidar_environment.hazards_in_body_frame()), atol=1e-9)
+
+
+def test_a_bearing_just_below_straight_ahead_reads_in_the_first_bin() -> None:
+    env = gymnasium.make("PointGoal1-v0").unwrapped
+    hazards = np.vstack([[[1.0, -1e-17]], np.full((7, 2), 20.0)])
+    observation, _ = env.reset(options={"state": exact_state(hazards=hazards)})
+    assert observation[layout(1).slice("hazards_lidar")][0] == pytest.approx(2 / 3)
+
+
+@pytest.mark.parametrize("level", [0, 1, 2])
+def test_pictures_show_the_cost(level: int) -> None:
+    env = PointGoalVectorEnv(level=level, num_envs=2, render_mode="rgb_array")
+    env.reset(seed=0)
+    pictures = env.render()
+    assert pictures is not None
+    assert [picture.shape for picture in pictures] == [(480, 480, 3)] * 2
+    if level == 1:
+        near = exact_state(hazards=np.vstack([[[0.05, 0.0]], np.full((7, 2), 20.0)]))
+        single = gymnasium.make("PointGoal1-v0", render_mode="rgb_array").unwrapped
+        single.reset(options={"state": near})
+        before = single.render()
+        single.step(np.zeros(2))
+        after = single.render()
+        red = [(p[0] == [214, 40, 40]).all() for p in (before, after)]
+        assert red == [False, True]

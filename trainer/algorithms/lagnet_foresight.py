@@ -1,0 +1,113 @@
+"""Lagnet with foresight: eq. 14 with a multiplier that knows what is coming.
+
+Eq. 15 is linear in λ: its optimum in each state is 0 or infinity. With a quadratic penalty,
+max E[λ (C̄ − w) − κ λ² / 2], the optimum is bounded, λ(s) = [C̄(s) − w]₊ / κ. Here C̄(s) is the discounted cost
+of the next moments, regressed by a network, so that λ rises on the approach and not only inside a hazard; and
+the one scale β = 1/κ is moved until the episode cost meets its limit. λ_ξ(s) = β C̄_ξ(s).
+"""
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from trainer.advantage import gae, successor_values
+from trainer.algorithms.base import Algorithm
+from trainer.algorithms.lagnet import statewise_update
+from trainer.algorithms.multiplier import MultiplierNetwork
+from trainer.critics import check_finite
+from trainer.dual import Numbers, number
+from trainer.learner import Batch, Learner
+from trainer.rollout import Figures
+
+
+class LagnetForesight(Algorithm):
+    """The policy maximises eq. 14 with λ_ξ(s) = β C̄_ξ(s); C̄_ξ is regressed, β follows the episode cost."""
+
+    def __init__(self, learner: Learner) -> None:
+        super().__init__(learner)
+        config = self.config
+        self.network = MultiplierNetwork(learner, config.foresight_init, config.foresight_learning_rate)
+        self.network.scale = config.scale_init
+
+    def update(self, batch: Batch, figures: Figures) -> dict[str, float]:
+        """One update on one epoch, see Algorithm.update."""
+        self.network.scale = next_scale(
+            self.network.scale,
+            self.cost_now(figures),
+            self.config.cost_limit * self.config.limit_share,
+            self.config.scale_gain,
+            self.config.scale_step,
+        )
+        loss = self._regress(batch)
+        with torch.no_grad():
+            multiplier = self.network(batch.observation)
+        return {
+            "multiplier": float(multiplier.mean()),
+            "multiplier_max": float(multiplier.max()),
+            "scale": self.network.scale,
+            "multiplier_loss": loss,
+        } | statewise_update(self.learner, batch, multiplier)
+
+    def cost_now(self, figures: Figures) -> float:
+        """What an episode of the latest epoch's steps costs: without the delay of finished episodes."""
+        return figures.step_cost * self.config.episode_steps
+
+    def _regress(self, batch: Batch) -> float:
+        """Passes of minibatch regression of C̄_ξ; returns the mean loss of the last one."""
+        config = self.config
+        targets = self.targets(batch)
+        mean = 0.0
+        for _ in range(config.multiplier_passes):
+            order = torch.from_numpy(self.learner.rng.permutation(batch.size))
+            losses = []
+            for rows in torch.split(order, config.minibatch):
+                loss = (self.network.raw(batch.observation[rows]) - targets[rows]).square().mean()
+                (gradient,) = torch.autograd.grad(loss, self.network.parameters)
+                self.learner.descend("multiplier", gradient)
+                losses.append(loss.detach())
+            mean = float(torch.stack(losses).mean())
+            check_finite({"multiplier loss": mean})
+        return mean
+
+    def targets(self, batch: Batch) -> Tensor:
+        """C̄(s_t) = Σ γ_f^k C_{t+k}, λ-returns with the network's own value at the ends [B]."""
+        config, trajectory = self.config, batch.trajectory
+        T, N = trajectory.cost.shape
+        with torch.no_grad():
+            last = self.network.raw(self.learner.normalised(trajectory.observation[-1]))
+            values = torch.cat([self.network.raw(batch.observation), last]).view(T + 1, N).numpy()
+            final = self.network.raw(self.learner.normalised(trajectory.final_observation)).numpy()
+        after = successor_values(values, trajectory.ended, trajectory.terminated, final)
+        ahead = gae(trajectory.cost, values, after, trajectory.ended, config.foresight, config.gae)
+        return torch.from_numpy(np.asarray(ahead + values[:-1]).reshape(-1))
+
+    def multiplier_network(self) -> MultiplierNetwork:
+        """λ_ξ."""
+        return self.network
+
+    def state(self) -> Numbers:
+        """The scale."""
+        return {"scale": self.network.scale}
+
+    def load_state(self, state: Numbers) -> None:
+        """Takes on the scale."""
+        self.network.scale = number(state["scale"])
+
+
+def next_scale(scale: float, cost: float, target: float, gain: float, step: float) -> float:
+    """β · exp(gain (J_c − d) / d), the exponent within ± step: dual ascent on log β.
+
+    Args:
+        scale: β.
+        cost: J_c.
+        target: d, or the share of it that is aimed at.
+        gain: of the relative excess.
+        step: largest change of log β.
+
+    Returns:
+        The next β.
+    """
+    excess = (cost - target) / max(target, 1e-3)
+    return scale * math.exp(max(-step, min(step, gain * excess)))
