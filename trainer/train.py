@@ -76,9 +76,9 @@ class Run:
         self.config = config
         self.folder = folder
         self.rng = np.random.default_rng(config.seed)
-        space: Any = env.single_observation_space
+        seen: Any = env.single_observation_space
         self.bounds: Any = env.single_action_space
-        self.learner = Learner(config, space.shape[0], self.bounds.shape[0], self.rng)
+        self.learner = Learner(config, seen.shape[0], self.bounds.shape[0], self.rng)
         self.algorithm: Algorithm = ALGORITHMS[config.algorithm](self.learner)
         self.rollout = Rollout(env, config.horizon, config.episode_steps, config.seed, self.rng)
         self.epoch = 0
