@@ -10,17 +10,14 @@ from evaluation.statistics import Summary
 
 _ROWS: tuple[tuple[str, Callable[[Summary], str]], ...] = (
     ("return", lambda s: f"{s.return_mean:.2f} ± {s.return_std:.2f}"),
-    ("return, 10th percentile", lambda s: f"{s.return_p10:.2f}"),
+    ("return p10", lambda s: f"{s.return_p10:.2f}"),
     ("cost", lambda s: f"{s.cost_mean:.3f}"),
     ("violating steps", lambda s: f"{s.violating_steps} of {s.steps}"),
-    ("episodes with a violation", lambda s: f"{s.violating_episodes} of {s.episodes}"),
-    (
-        "  rate [95 % interval]",
-        lambda s: f"{s.violation_rate:.1%} [{s.violation_low:.1%}, {s.violation_high:.1%}]",
-    ),
-    ("interventions", lambda s: f"{s.interventions} ({s.interventions / s.steps:.1%} of steps)"),
-    ("  of them fallbacks", lambda s: f"{s.fallbacks}"),
-    ("decision time p50 / p99", lambda s: f"{s.decision_p50 * 1e6:.0f} / {s.decision_p99 * 1e6:.0f} µs"),
+    ("violating episodes", lambda s: f"{s.violating_episodes} of {s.episodes}"),
+    ("  95 % interval", lambda s: f"{s.violation_low:.1%} to {s.violation_high:.1%}"),
+    ("interventions", lambda s: f"{s.interventions / s.steps:.1%} of steps"),
+    ("  fallbacks", lambda s: f"{s.fallbacks} steps"),
+    ("decision p50 / p99", lambda s: f"{s.decision_p50 * 1e6:.0f} / {s.decision_p99 * 1e6:.0f} µs"),
 )
 
 

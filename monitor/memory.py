@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from typing import Any
@@ -11,12 +12,12 @@ from numpy.typing import NDArray
 
 from filter import FilterMemory
 
+_NAMES = tuple(field.name for field in fields(FilterMemory))
+
 
 def take(memory: FilterMemory, index: int) -> FilterMemory:
     """One robot's share of a batch's memory, as the memory of a batch of one."""
-    return FilterMemory(
-        **{field.name: getattr(memory, field.name)[index : index + 1] for field in fields(memory)}
-    )
+    return FilterMemory(**{name: getattr(memory, name)[index : index + 1] for name in _NAMES})
 
 
 def join(memories: Sequence[FilterMemory | None]) -> FilterMemory | None:
@@ -24,9 +25,8 @@ def join(memories: Sequence[FilterMemory | None]) -> FilterMemory | None:
     known = [memory for memory in memories if memory is not None]
     if len(known) < len(memories):
         return None
-    names = [field.name for field in fields(FilterMemory)]
     return FilterMemory(
-        **{name: np.concatenate([getattr(memory, name) for memory in known]) for name in names}
+        **{name: np.concatenate([getattr(memory, name) for memory in known]) for name in _NAMES}
     )
 
 
@@ -34,10 +34,10 @@ def memory_to_json(memory: FilterMemory | None) -> dict[str, list[float | int]] 
     """One robot's memory as plain JSON, to be handed back with the next observation."""
     if memory is None:
         return None
-    return {field.name: getattr(memory, field.name)[0:1].tolist() for field in fields(memory)}
+    return {name: getattr(memory, name)[0].ravel().tolist() for name in _NAMES}
 
 
-def memory_from_json(value: Mapping[str, object] | None) -> FilterMemory | None:
+def memory_from_json(value: Mapping[str, Sequence[float | int]] | None) -> FilterMemory | None:
     """The inverse of `memory_to_json`.
 
     Raises:
@@ -46,21 +46,18 @@ def memory_from_json(value: Mapping[str, object] | None) -> FilterMemory | None:
     if value is None:
         return None
     empty = FilterMemory.empty(1)
-    names = {field.name for field in fields(empty)}
-    if set(value) != names:
-        raise ValueError(f"memory has the fields {sorted(value)}, expected {sorted(names)}")
-    return FilterMemory(**{name: _array(name, value[name], getattr(empty, name)) for name in names})
+    if set(value) != set(_NAMES):
+        raise ValueError(f"memory has the fields {sorted(value)}, expected {sorted(_NAMES)}")
+    return FilterMemory(**{name: _array(name, value[name], getattr(empty, name)) for name in _NAMES})
 
 
-def _array(name: str, value: object, like: NDArray[Any]) -> NDArray[Any]:
-    try:
-        array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"memory.{name} must hold numbers") from error
-    if array.shape != like.shape or not np.isfinite(array).all():
-        raise ValueError(f"memory.{name} must have shape {list(like.shape)} and finite numbers")
+def _array(name: str, numbers: Sequence[float | int], like: NDArray[Any]) -> NDArray[Any]:
+    if len(numbers) != like.size:
+        raise ValueError(f"memory.{name} must hold {like.size} numbers, got {len(numbers)}")
     if np.issubdtype(like.dtype, np.integer):
         limits = np.iinfo(like.dtype)
-        if (array != np.rint(array)).any() or array.min() < limits.min or array.max() > limits.max:
+        if not all(limits.min <= number <= limits.max and number == int(number) for number in numbers):
             raise ValueError(f"memory.{name} must hold whole numbers in {limits.min}..{limits.max}")
-    return array.astype(like.dtype)
+    elif not all(math.isfinite(number) for number in numbers):
+        raise ValueError(f"memory.{name} must hold finite numbers")
+    return np.array(numbers).astype(like.dtype).reshape(like.shape)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import http.client
-import json
 import math
 import time
 from collections.abc import Mapping, Sequence
@@ -14,6 +13,7 @@ from urllib.parse import urlsplit
 import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import ValidationError
+from pydantic_core import to_json
 
 from server.link import Link
 from server.schema import ActReply, MemoryJson, ModelReply
@@ -93,7 +93,7 @@ class Client:
         try:
             body = self._body(observation, hazards)
         except (TypeError, ValueError) as error:
-            return self._safe(f"observation or hazards cannot be sent: {error}", started)
+            return self._safe(f"cannot be sent: {error}", started)
         try:
             status, content = self._link.exchange("POST", "/act", body, self._timeout)
             if status != http.client.OK:
@@ -148,12 +148,21 @@ class Client:
         return model
 
     def _body(self, observation: ArrayLike, hazards: ArrayLike | None) -> bytes:
-        body: dict[str, Any] = {"observation": np.asarray(observation, dtype=np.float64).tolist()}
+        body: dict[str, Any] = {"observation": _numbers("observation", observation)}
         if hazards is not None:
-            body["hazards"] = np.asarray(hazards, dtype=np.float64).tolist()
+            body["hazards"] = _numbers("hazards", hazards)
         if self._memory is not None:
             body["memory"] = self._memory
-        return json.dumps(body, allow_nan=False).encode()
+        return to_json(body)
 
     def _safe(self, reason: str, started: float) -> ActReply:
         return ActReply.safe(reason, time.perf_counter() - started, self._memory)
+
+
+def _numbers(name: str, values: ArrayLike) -> list[Any]:
+    array = np.asarray(values, dtype=np.float64)
+    # The serialiser would send NaN and Inf as null.
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name} has values that are not finite")
+    numbers: list[Any] = array.tolist()
+    return numbers

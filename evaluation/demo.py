@@ -1,0 +1,143 @@
+"""The demo: a service for each gate, robots driving through it, a table, a picture and an animation."""
+
+from __future__ import annotations
+
+import json
+import signal
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import Annotated
+
+import numpy as np
+import tyro
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+from evaluation.closed_loop import Episodes, run_episodes
+from evaluation.deciders import OverHttp
+from evaluation.pictures import Drive, animate, draw_drives, drive
+from evaluation.service import Service, ServiceError
+from evaluation.statistics import summarise
+from evaluation.tables import summary_table
+from models import Bundle, BundleError
+from monitor import Gate
+from pointgoal.observation import layout
+from server import ClientError
+
+_GATES: tuple[Gate, ...] = ("off", "risk", "always")
+_EPISODE_STEPS = 1000
+
+
+@dataclass(frozen=True)
+class DemoConfig:
+    """Drives a bundle through POST /act under every gate and shows what became of the robots.
+
+    Each gate gets a `lagnet-serve` of its own on a free port, stopped at the end whatever happens.
+    """
+
+    bundle: Annotated[Path, tyro.conf.Positional]
+    """The bundle's folder, for example models/NAME."""
+    out: Path = Path("demo")
+    """Folder for the table, the picture and the animation."""
+    episodes: int = 20
+    """How many episodes for each gate, the same ones."""
+    seed: int = 0
+    """Seed of the first episode; the others count on."""
+    timeout: float = 1.0
+    """How long a robot waits for its action [s]."""
+
+
+def run_demo(config: DemoConfig, console: Console) -> None:
+    """Runs the demo.
+
+    Raises:
+        BundleError, ServiceError, ClientError: if a service cannot be had.
+        OSError: if the folder cannot be written.
+    """
+    started = time.monotonic()
+    bundle = Bundle.load(config.bundle)
+    config.out.mkdir(parents=True, exist_ok=True)
+    console.print(
+        f"[bold]{bundle.id}[/] on {bundle.manifest.task}, through POST /act, {config.episodes} robots at once"
+    )
+    runs = {gate: _drive_through(gate, bundle, config, console) for gate in _GATES}
+    summaries = {gate: summarise(episodes) for gate, episodes in runs.items()}
+    table = summary_table(
+        f"{config.episodes} episodes, hazards given, over HTTP",
+        {f"gate {g}": s for g, s in summaries.items()},
+    )
+    console.print(table)
+    figures = {gate: summary.to_json() for gate, summary in summaries.items()}
+    (config.out / "summary.json").write_text(
+        json.dumps(figures, indent=2, allow_nan=False) + "\n", encoding="utf-8"
+    )
+    with (config.out / "table.txt").open("w", encoding="utf-8") as file:
+        Console(file=file, width=110).print(table)
+    shown = choose_episode(runs["off"], runs["always"])
+    drives: dict[str, Drive] = {
+        gate: drive(episodes.trajectory, shown) for gate, episodes in runs.items() if episodes.trajectory
+    }
+    picture, animation = config.out / "episode.png", config.out / "episode.gif"
+    title = f"One robot, one policy, three gates: episode {shown + 1} of {config.episodes}"
+    draw_drives(picture, drives, bundle.manifest.threshold, title)
+    animate(animation, {gate: drives[gate] for gate in ("off", "always")})
+    console.print(f"{picture}: the path, where the filter acted, λ, barrier and cost over time")
+    console.print(f"{animation}: the same episode without and with the filter")
+    console.print(f"done in {time.monotonic() - started:.0f} s")
+
+
+def _drive_through(gate: Gate, bundle: Bundle, config: DemoConfig, console: Console) -> Episodes:
+    """The episodes under one gate, through a service of its own."""
+    bar = Progress(
+        TextColumn("gate {task.description:<6}"),
+        BarColumn(),
+        TimeRemainingColumn(),
+        console=console,
+        transient=True,
+    )
+    wanted = layout(bundle.manifest.level).to_json()
+    with (
+        bar,
+        Service.start(config.bundle, gate) as service,
+        OverHttp(service.url, wanted, config.timeout) as decider,
+    ):
+        job = bar.add_task(gate, total=config.episodes * _EPISODE_STEPS)
+        return run_episodes(
+            bundle.manifest.task,
+            decider,
+            config.episodes,
+            config.seed,
+            record=True,
+            progress=lambda steps: bar.advance(job, steps),
+        )
+
+
+def choose_episode(off: Episodes, always: Episodes) -> int:
+    """The episode to show: among the better half with the filter, the one that needed it most."""
+    good = always.returns >= np.median(always.returns)
+    return int(np.argmax(np.where(good, off.violating_steps, -1)))
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    """SIGTERM ends the demo as Ctrl-C does, so that the service is stopped on the way out."""
+    raise KeyboardInterrupt
+
+
+def main() -> None:
+    """Entry point of `python -m evaluation.demo`."""
+    config = tyro.cli(DemoConfig, prog="python -m evaluation.demo")
+    signal.signal(signal.SIGTERM, _interrupt)
+    try:
+        run_demo(config, Console())
+    except (BundleError, ServiceError, ClientError, OSError) as error:
+        Console(stderr=True).print(f"demo: {error}", style="red", markup=False, soft_wrap=True)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()
