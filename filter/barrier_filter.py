@@ -16,12 +16,14 @@ from filter.certificate import certify
 from filter.compiled import SOURCES, compiled, entry
 from filter.config import FilterConfig, Settings, settings
 from filter.errors import FilterInputError, SolverError
-from filter.lidar import CONES, decode
-from filter.obstacles import COLUMNS
+from filter.detour import shortest_path, steer
+from filter.lidar import CONES, decode, decode_goal, likeliest
+from filter.obstacles import COLUMNS, FAR, least_gap
 from filter.qp import Problem, build_rows
+from filter.recovery import drive_out
 from filter.robot import State, stopping
 from filter.solvers import TOLERANCE, Solver, solve_batch, solver
-from pointgoal.observation import LIDAR_RANGE, layout
+from pointgoal.observation import LIDAR_BINS, LIDAR_RANGE, layout
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -51,6 +53,8 @@ class Row(IntEnum):
     """There was none."""
     BARRIER = 1
     """A barrier row of the QP: the nominal action would have let a clearance fall too fast."""
+    DETOUR = 4
+    """A hazard is in the straight way to the goal: the action drives round it."""
     SEARCH = 2
     """The QP's action had no certificate; the nearest certified one was sent."""
     BACKUP = 3
@@ -131,6 +135,20 @@ def _select(
 
 
 @compiled
+def _discs(config: Settings, given: FloatArray, out: FloatArray, source: IntArray) -> int:
+    """The given hazards as discs to drive round; how many there are."""
+    count = 0
+    for i in range(given.shape[0]):
+        x, y = given[i]
+        if x == x:
+            radius = config.hazard_radius + config.margin + config.bearing_error * math.hypot(x, y)
+            out[count] = (x, y, radius + config.clearance)
+            source[count] = i
+            count += 1
+    return count
+
+
+@compiled
 def _search(
     config: Settings, obstacles: FloatArray, count: int, state: State, x: FloatArray, action: FloatArray
 ) -> bool:
@@ -162,6 +180,15 @@ def _backup_action(config: Settings, obstacles: FloatArray, count: int, state: S
     return thrust * robot.force_limit, turn / most
 
 
+@compiled
+def _why(config: Settings, obstacles: FloatArray, count: int, barrier: float) -> int:
+    """The number of the reason for a fallback, see `REASONS`."""
+    here, _ = least_gap(obstacles, count, 0.0, 0.0, 0.0, 0.0, -1, -FAR)
+    if here < -config.margin:
+        return 2
+    return 3 if barrier < -config.margin else 1
+
+
 def _entries() -> tuple[Callable[..., None], ...]:
     sources = SOURCES
 
@@ -171,6 +198,8 @@ def _entries() -> tuple[Callable[..., None], ...]:
         states: FloatArray,
         given: FloatArray,
         readings: FloatArray,
+        goals: FloatArray,
+        sides: NDArray[np.int8],
         nominal: FloatArray,
         active: BoolArray,
         obstacles: FloatArray,
@@ -183,6 +212,8 @@ def _entries() -> tuple[Callable[..., None], ...]:
         h: FloatArray,
         rows: IntArray,
         origin: IntArray,
+        discs: FloatArray,
+        disc_source: IntArray,
     ) -> None:
         """Decode, screen, and build the QPs of those robots whose nominal action is not certified (rows >= 0)."""
         if not sources:
@@ -200,6 +231,8 @@ def _entries() -> tuple[Callable[..., None], ...]:
             count[k] = n
             rows[k] = -1
             hazard[k] = -1
+            side = sides[k]
+            sides[k] = 0
             if n == 0:
                 barrier[k] = LIDAR_RANGE
                 continue
@@ -207,8 +240,47 @@ def _entries() -> tuple[Callable[..., None], ...]:
             barrier[k] = min(value, LIDAR_RANGE)
             if not active[k]:
                 continue
-            value, blocker, _, _ = certify(config, obstacles[k], n, state, nominal[k, 0], nominal[k, 1], 0.0)
-            if value >= 0.0:
+            hazard[k] = -1
+            detour = False
+            value, blocker, _, _ = certify(
+                config, obstacles[k], n, state, nominal[k, 0], nominal[k, 1], config.hysteresis
+            )
+            if config.lookahead > 0.0:
+                found, goal_x, goal_y = decode_goal(goals[k])
+                if found:
+                    if readings.shape[1] > 0:
+                        m = likeliest(readings[k], grow + config.clearance, discs, disc_source)
+                    else:
+                        m = _discs(config, given[k], discs, disc_source)
+                    now = stopping(config.robot, state)
+                    way = shortest_path(discs, m, goal_x, goal_y, now.zx, now.zy, side, config.mind)
+                    stuck = value < config.hysteresis and math.hypot(now.zx, now.zy) < config.slow
+                    detour = way.blocker >= 0 and way.distance < config.lookahead
+                    if detour:
+                        sides[k] = way.side
+                        hazard[k] = disc_source[way.blocker]
+                    elif stuck:
+                        hazard[k] = source[k, blocker]
+                        detour = True
+                    if detour:
+                        reference[k] = steer(config, discs, m, state, way.x, way.y)
+                        value, _, _, _ = certify(
+                            config,
+                            obstacles[k],
+                            n,
+                            state,
+                            reference[k, 0] * limit,
+                            reference[k, 1],
+                            config.hysteresis,
+                        )
+                        if value >= config.hysteresis:
+                            rows[k] = -2
+                        else:
+                            rows[k] = build_rows(
+                                config, obstacles[k], n, state, reference[k], G[k], h[k], origin[k], work
+                            )
+                        continue
+            if value >= config.hysteresis:
                 continue
             hazard[k] = source[k, blocker]
             reference[k, 0] = min(max(nominal[k, 0] / limit, -1.0), 1.0)
@@ -235,14 +307,23 @@ def _entries() -> tuple[Callable[..., None], ...]:
             return
         limit = config.robot.force_limit
         for k in range(states.shape[0]):
-            if rows[k] < 0:
+            if rows[k] == -1:
+                continue
+            if rows[k] == -2:
+                mode[k] = 1
+                row[k] = 4
+                action[k, 0] = solution[k, 0] * limit
+                action[k, 1] = solution[k, 1]
                 continue
             state = State(0.0, 0.0, 0.0, states[k, 0], states[k, 1], states[k, 2])
             n = count[k]
             mode[k] = 1
             if solved[k]:
                 f, w = solution[k]
-                if certify(config, obstacles[k], n, state, f * limit, w, 0.0)[0] >= 0.0:
+                if (
+                    certify(config, obstacles[k], n, state, f * limit, w, config.hysteresis)[0]
+                    >= config.hysteresis
+                ):
                     action[k, 0] = f * limit
                     action[k, 1] = w
                     row[k] = 1
@@ -252,8 +333,8 @@ def _entries() -> tuple[Callable[..., None], ...]:
                 continue
             mode[k] = 2
             row[k] = 3
-            reason[k] = 1
-            action[k] = _backup_action(config, obstacles[k], n, state)
+            reason[k] = _why(config, obstacles[k], n, barrier[k])
+            action[k] = drive_out(config, obstacles[k], n, state)
 
     @entry
     def backups(
@@ -316,15 +397,17 @@ class BarrierFilter:
                 nominal[i : i + _CHUNK],
                 None if given is None else given[i : i + _CHUNK],
                 active[i : i + _CHUNK],
+                memory.side[i : i + _CHUNK],
             )
             for i in range(0, n, _CHUNK)
         ]
         if len(parts) == 1:
-            action, mode, barrier, hazard, row, reason = parts[0]
+            action, mode, barrier, hazard, row, reason, side = parts[0]
         else:
-            action, mode, barrier, hazard, row, reason = (
-                np.concatenate([part[i] for part in parts]) if parts else _EMPTY[i] for i in range(6)
+            action, mode, barrier, hazard, row, reason, side = (
+                np.concatenate([part[i] for part in parts]) if parts else _EMPTY[i] for i in range(7)
             )
+        memory = FilterMemory(side)
         reasons = [REASONS[code] for code in reason.tolist()]
         return FilterResult(action, mode, barrier, hazard, row, reasons, memory)
 
@@ -334,7 +417,7 @@ class BarrierFilter:
         """The QP of one robot, observation (60,), action (2,), hazards (n, 2); None where the action passes."""
         observation, nominal = _check_inputs(np.asarray(observation)[None], np.asarray(nominal_action)[None])
         given = None if hazards is None else _check_hazards(np.asarray(hazards)[None], 1)
-        work = self._prepare(observation, nominal, given, np.ones(1, dtype=bool))
+        work = self._prepare(observation, nominal, given, np.ones(1, dtype=bool), np.zeros(1, dtype=np.int8))
         return self._problem(work, 0) if work["rows"][0] >= 0 else None
 
     def backup(self, observation: FloatArray, hazards: FloatArray | None = None) -> FloatArray:
@@ -350,12 +433,17 @@ class BarrierFilter:
         n = len(observation)
         observation, action = _check_inputs(observation, np.zeros((n, 2)))
         given = None if hazards is None else _check_hazards(hazards, n)
-        work = self._prepare(observation, action, given, np.zeros(n, dtype=bool))
+        work = self._prepare(observation, action, given, np.zeros(n, dtype=bool), np.zeros(n, dtype=np.int8))
         _backups(self._settings, work["states"], work["obstacles"], work["count"], action)
         return action
 
     def _prepare(
-        self, observation: FloatArray, nominal: FloatArray, given: FloatArray | None, active: BoolArray
+        self,
+        observation: FloatArray,
+        nominal: FloatArray,
+        given: FloatArray | None,
+        active: BoolArray,
+        side: NDArray[np.int8],
     ) -> dict[str, Any]:
         n = len(observation)
         where = layout(0 if observation.shape[1] == _SIZES[0] else 1)
@@ -382,9 +470,12 @@ class BarrierFilter:
             "h": np.empty((n, size)),
             "rows": np.empty(n, dtype=np.int64),
             "origin": np.empty((n, size), dtype=np.int64),
+            "discs": np.empty((max(size, LIDAR_BINS), 3)),
+            "disc_source": np.empty(max(size, LIDAR_BINS), dtype=np.int64),
         }
+        goals = np.ascontiguousarray(observation[:, where.slice("goal_lidar")])
         outputs = list(work.values())[1:]
-        _prepare(self._settings, states, given, readings, nominal, active, *outputs)
+        _prepare(self._settings, states, given, readings, goals, side, nominal, active, *outputs)
         return work
 
     def _problem(self, work: dict[str, Any], k: int) -> Problem:
@@ -411,19 +502,25 @@ class BarrierFilter:
         return solution, solved
 
     def _chunk(
-        self, observation: FloatArray, nominal: FloatArray, given: FloatArray | None, active: BoolArray
+        self,
+        observation: FloatArray,
+        nominal: FloatArray,
+        given: FloatArray | None,
+        active: BoolArray,
+        side: NDArray[np.int8],
     ) -> tuple[Any, ...]:
-        work = self._prepare(observation, nominal, given, active)
+        side = side.copy()
+        work = self._prepare(observation, nominal, given, active, side)
         n = len(observation)
         action = nominal.copy()
         mode, row, reason = np.zeros((3, n), dtype=np.int8)
-        if (work["rows"] >= 0).any():
+        if (work["rows"] != -1).any():
             solution, solved = self._solve(work)
             names = ("states", "obstacles", "count", "barrier", "rows")
             _finish(
                 self._settings, *(work[name] for name in names), solution, solved, action, mode, row, reason
             )
-        return action, mode, work["barrier"], work["hazard"], row, reason
+        return action, mode, work["barrier"], work["hazard"], row, reason, side
 
 
 def committed_backup(observation: FloatArray, hazards: FloatArray | None = None) -> FloatArray:
@@ -448,6 +545,7 @@ _EMPTY: tuple[NDArray[Any], ...] = (
     np.empty(0, dtype=np.int8),
     np.empty(0),
     np.empty(0, dtype=np.int64),
+    np.empty(0, dtype=np.int8),
     np.empty(0, dtype=np.int8),
     np.empty(0, dtype=np.int8),
 )

@@ -31,6 +31,18 @@ class FilterConfig:
     """Share of the barrier that the QP lets one control step take away, in (0, 1]; 1 brakes last."""
     thrust_weight: float = 4.0
     """Weight of a change of thrust in the QP, against 1 for a change of turn: prefer turning to braking."""
+    lookahead: float = 1.2
+    """A hazard nearer than this on the straight way to the goal is driven round; 0 turns that off [m]."""
+    clearance: float = 0.06
+    """Distance that the way round keeps from what the certificate asks for [m]."""
+    repulsion: float = 4.0
+    eager: float = 2.0
+    keep_off: float = 0.005
+    hysteresis: float = 0.001
+    mind: float = 0.5
+    slow: float = 0.1
+    pursuit: float = 0.8
+    """Least distance of the point that the way round steers at [m]."""
     solver: str = "planar"
     """QP solver: "planar" (ours, two variables, compiled), "osqp" (kept workspace) or any that qpsolvers knows."""
     robot: Robot = field(default_factory=Robot)
@@ -63,6 +75,15 @@ class Settings(NamedTuple):
     hazard_radius: float
     rate: float
     thrust_weight: float
+    lookahead: float
+    clearance: float
+    pursuit: float
+    repulsion: float
+    eager: float
+    keep_off: float
+    hysteresis: float
+    mind: float
+    slow: float
 
 
 def settings(config: FilterConfig) -> Settings:
@@ -75,4 +96,13 @@ def settings(config: FilterConfig) -> Settings:
         hazard_radius=config.hazard_radius,
         rate=config.rate,
         thrust_weight=config.thrust_weight,
+        lookahead=config.lookahead,
+        clearance=config.clearance,
+        pursuit=config.pursuit,
+        repulsion=config.repulsion,
+        eager=config.eager,
+        keep_off=config.keep_off,
+        hysteresis=config.hysteresis,
+        mind=config.mind,
+        slow=config.slow,
     )

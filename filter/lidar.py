@@ -132,3 +132,54 @@ def _cover(
         source[count] = b
         count += 1
     return count
+
+
+@compiled
+def decode_goal(readings: FloatArray) -> tuple[bool, float, float]:
+    """Where the goal is, which is alone in its lidar: whether it is in range, and its place x, y [m]."""
+    best = 0
+    for b in range(1, LIDAR_BINS):
+        if readings[b] > readings[best]:
+            best = b
+    strongest = readings[best]
+    if strongest <= 0.0:
+        return False, 0.0, 0.0
+    bearing = (best + readings[(best + 1) % LIDAR_BINS] / strongest) * BIN_WIDTH
+    distance = LIDAR_RANGE * (1.0 - strongest)
+    return True, distance * math.cos(bearing), distance * math.sin(bearing)
+
+
+@compiled
+def likeliest(readings: FloatArray, radius: float, out: FloatArray, source: IntArray) -> int:
+    """One disc for each hazard that the readings tell apart: a guess to plan with, not to be safe by.
+
+    A bin that shows more than its neighbours' hazards explain has one of its own, in the middle of where it can be.
+
+    Args:
+        readings: (16,) the hazards' lidar.
+        radius: of the discs [m].
+        out: (>= 16, 3) receives centres and radii [m].
+        source: (>= 16,) receives each one's bin.
+
+    Returns:
+        How many discs there are.
+    """
+    count = 0
+    for b in range(LIDAR_BINS):
+        before = readings[(b + LIDAR_BINS - 1) % LIDAR_BINS]
+        after = readings[(b + 1) % LIDAR_BINS]
+        strongest = min(readings[b], before + after)
+        spill = max(
+            before - readings[(b + LIDAR_BINS - 2) % LIDAR_BINS], after - readings[(b + 2) % LIDAR_BINS]
+        )
+        if strongest <= spill + 1e-6 and strongest < max(before, after):
+            continue
+        if strongest <= 0.0:
+            continue
+        low, high = shares(strongest, before, after)
+        bearing = (b + 0.5 * (low + high)) * BIN_WIDTH
+        distance = LIDAR_RANGE * (1.0 - strongest)
+        out[count] = (distance * math.cos(bearing), distance * math.sin(bearing), radius)
+        source[count] = b
+        count += 1
+    return count

@@ -104,7 +104,13 @@ def build_rows(
     for i in range(count):
         gf = (work[2, i] - work[1, i]) / df
         gw = (work[3, i] - work[1, i]) / dw
-        bound = work[1, i] - gf * f - gw * w - (1.0 - settings.rate) * work[0, i]
+        bound = (
+            work[1, i]
+            - gf * f
+            - gw * w
+            - (1.0 - settings.rate) * work[0, i]
+            - settings.rate * settings.keep_off
+        )
         if abs(gf) + abs(gw) > bound:
             G[rows, 0] = -gf
             G[rows, 1] = -gw

@@ -84,7 +84,7 @@ class Stopping(NamedTuple):
     Without thrust the momentum decays through drag alone, so the origin comes to rest exactly at
     p + tau * v_c, with v_c the velocity of the centre of mass and tau the time constant, however it turns on the
     way. This stop point obeys dz/dt = V f e(heading), f in [-1, 1] the share of full thrust and V = `stop_speed`:
-    no drift; and the robot follows it, dp/dt = (z - p) / tau.
+    no drift; and the robot follows it, dp/dt = (z - p) / tau - c de/dt, c the offset of the centre of mass.
     """
 
     x: float
@@ -171,4 +171,9 @@ def follow(robot: Robot, at: Stopping, thrust: float, turn: float, seconds: floa
     fade = math.exp(-seconds / tau)
     x = at.zx + qx * (seconds - tau) + (at.x - at.zx + qx * tau) * fade
     y = at.zy + qy * (seconds - tau) + (at.y - at.zy + qy * tau) * fade
-    return Stopping(x, y, at.zx + qx * seconds, at.zy + qy * seconds, at.heading + turn)
+    after = at.heading + turn
+    if turn != 0.0:
+        # The robot turns about its centre of mass, so the origin swings round.
+        x -= robot.offset * (math.cos(after) - math.cos(at.heading))
+        y -= robot.offset * (math.sin(after) - math.sin(at.heading))
+    return Stopping(x, y, at.zx + qx * seconds, at.zy + qy * seconds, after)
