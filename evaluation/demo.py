@@ -92,11 +92,12 @@ def run_demo(config: DemoConfig, console: Console) -> None:
 def _drive_through(gate: Gate, bundle: Bundle, config: DemoConfig, console: Console) -> Episodes:
     """The episodes under one gate, through a service of its own."""
     bar = Progress(
-        TextColumn("gate {task.description:<6}"),
+        TextColumn("{task.description}"),
         BarColumn(),
         TimeRemainingColumn(),
         console=console,
         transient=True,
+        disable=not console.is_terminal,
     )
     wanted = layout(bundle.manifest.level).to_json()
     with (
@@ -104,7 +105,7 @@ def _drive_through(gate: Gate, bundle: Bundle, config: DemoConfig, console: Cons
         Service.start(config.bundle, gate) as service,
         OverHttp(service.url, wanted, config.timeout) as decider,
     ):
-        job = bar.add_task(gate, total=config.episodes * _EPISODE_STEPS)
+        job = bar.add_task(f"gate {gate}", total=config.episodes * _EPISODE_STEPS)
         return run_episodes(
             bundle.manifest.task,
             decider,

@@ -80,7 +80,12 @@ def evaluate(config: EvaluateConfig, console: Console) -> tuple[Summary, Episode
         raise EvaluateError(f"--timeout must be finite and positive, got {config.timeout}")
     bundle = Bundle.load(config.bundle)
     bar = Progress(
-        TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn(), console=console, transient=True
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TimeRemainingColumn(),
+        console=console,
+        transient=True,
+        disable=not console.is_terminal,
     )
     with bar, _decider(config, bundle) as (decider, who):
         task = config.task or bundle.manifest.task

@@ -103,13 +103,21 @@ def write_bundle(path: str | Path, policy_onnx: bytes, multiplier_onnx: bytes, m
             (fresh / POLICY_FILE).write_bytes(policy_onnx)
             (fresh / MULTIPLIER_FILE).write_bytes(multiplier_onnx)
             (fresh / MANIFEST_FILE).write_text(Manifest.model_validate(complete).to_json(), encoding="utf-8")
-            Bundle.load(fresh)
+            _check(fresh, target)
             _move_into_place(fresh, target, aside=temporary / "old")
         finally:
             shutil.rmtree(temporary, ignore_errors=True)
     except OSError as error:
         raise BundleError(f"{target}: cannot be written: {error.strerror or error}") from error
     return Bundle.load(target)
+
+
+def _check(fresh: Path, target: Path) -> None:
+    """Loads what was just written; an error names the place that the caller asked for."""
+    try:
+        Bundle.load(fresh)
+    except BundleError as error:
+        raise BundleError(str(error).replace(str(fresh), str(target))) from error
 
 
 def _move_into_place(fresh: Path, target: Path, aside: Path) -> None:

@@ -2,7 +2,7 @@
 
 The runtime installs onnxruntime but not onnx, and onnxruntime tells neither the opset nor whether a tensor
 lives in another file (it would open that file, relative to the working directory). Both must be known before
-a session sees the bytes, so this reads the few fields that matter. Field numbers: onnx/onnx.proto of ONNX 1.17.
+a session sees the bytes, so this reads the few fields that matter. Field numbers: onnx.proto of ONNX 1.17.
 """
 
 from __future__ import annotations

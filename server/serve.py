@@ -73,13 +73,29 @@ class ServeConfig:
 
 
 class DrainingServer(uvicorn.Server):
-    """A uvicorn server that says "not ready" for a while before it stops accepting connections."""
+    """A uvicorn server that announces itself, and says "not ready" for a while before it stops.
 
-    def __init__(self, config: uvicorn.Config, lifecycle: Lifecycle, drain_seconds: float) -> None:
+    Args:
+        config: uvicorn's settings.
+        lifecycle: shared with the app.
+        drain_seconds: how long it says so [s].
+        announcement: a line for stdout, written once it listens and stops in order when told to.
+    """
+
+    def __init__(
+        self, config: uvicorn.Config, lifecycle: Lifecycle, drain_seconds: float, announcement: str
+    ) -> None:
         super().__init__(config)
         self._lifecycle = lifecycle
         self._drain_seconds = drain_seconds
+        self._announcement = announcement
         self._stop_at: float | None = None
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Starts to listen, and says so."""
+        await super().startup(sockets)
+        sys.stdout.write(self._announcement + "\n")
+        sys.stdout.flush()
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
         """First signal: drain; second: stop at once. Neither is raised again after the shutdown."""
@@ -154,12 +170,11 @@ def serve(config: ServeConfig) -> None:
         host, port = listener.getsockname()[:2]
         url = f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
         ready = {"event": "listening", "url": url, "host": host, "port": port, "model": monitor.bundle.id}
-        sys.stdout.write(json.dumps(ready | {"gate": monitor.gate, "threshold": monitor.threshold}) + "\n")
-        sys.stdout.flush()
-        _server(app, lifecycle, config).run(sockets=[listener])
+        announcement = json.dumps(ready | {"gate": monitor.gate, "threshold": monitor.threshold})
+        _server(app, lifecycle, config, announcement).run(sockets=[listener])
 
 
-def _server(app: ASGIApp, lifecycle: Lifecycle, config: ServeConfig) -> DrainingServer:
+def _server(app: ASGIApp, lifecycle: Lifecycle, config: ServeConfig, announcement: str) -> DrainingServer:
     settings = uvicorn.Config(
         app,
         access_log=False,
@@ -171,7 +186,7 @@ def _server(app: ASGIApp, lifecycle: Lifecycle, config: ServeConfig) -> Draining
         limit_concurrency=config.max_connections,
         timeout_graceful_shutdown=_LAST_WORDS,
     )
-    return DrainingServer(settings, lifecycle, config.drain_seconds)
+    return DrainingServer(settings, lifecycle, config.drain_seconds, announcement)
 
 
 def main() -> None:

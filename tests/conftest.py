@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -92,3 +93,24 @@ def make_bundle(
         manifest(level),
     )
     return bundle.path
+
+
+@pytest.fixture
+def make_bundle_of() -> Callable[..., Path]:
+    """Makes a bundle of tiny networks at a level, the multiplier's ending in some operators of one input."""
+
+    def make(path: Path, level: int = 1, multiplier_tail: list[str] | None = None) -> Path:
+        if multiplier_tail is None:
+            return make_bundle(path, level=level)
+        names = ["flattened", *(f"tail{k}" for k in range(1, len(multiplier_tail))), "multiplier"]
+        nodes = [
+            helper.make_node("Softplus", ["raw"], ["positive"]),
+            helper.make_node("Reshape", ["positive", "flat"], ["flattened"]),
+            *(
+                helper.make_node(operator, [before], [after])
+                for operator, before, after in zip(multiplier_tail, names[:-1], names[1:], strict=True)
+            ),
+        ]
+        return make_bundle(path, multiplier=multiplier_mlp(nodes=nodes), level=level)
+
+    return make
