@@ -41,7 +41,7 @@ class Config:
     episode_steps: int = 1000
     """Steps of a full episode [steps]; turns the cost limit into the state-wise limit."""
     threads: int = 2
-    """Threads for physics and for torch. Results repeat bit for bit only with the same number."""
+    """Threads for physics, and for the update (one for the policy, one for the critics)."""
 
     discount: float = 0.99
     """Discount γ of the reward and of the cost."""
@@ -68,12 +68,15 @@ class Config:
     initial_log_std: float = -0.5
     """Initial log standard deviation of the policy's actions."""
 
+    rescale: Literal["mean", "state"] | None = None
+    """lagnet, lagnet-foresight: divide eq. 14 by 1 + mean λ, or each state's term by 1 + λ_ξ(s). None takes
+    "mean" for lagnet and "state" for lagnet-foresight."""
     multiplier_init: float = 20.0
     """lagnet: the value λ_ξ(s) starts at in every state (the paper's is about 20)."""
     multiplier_learning_rate: float = 3e-4
     """lagnet: Adam's step size for the multiplier network's ascent on eq. 15."""
     multiplier_passes: int = 1
-    """lagnet: passes of that ascent over an epoch's states."""
+    """lagnet, lagnet-foresight: passes over an epoch for the multiplier network (at most `passes`)."""
 
     foresight: float = 0.95
     """lagnet-foresight: discount γ_f of the future cost that C̄_ξ(s) adds up (0.95: about 0.4 s)."""
@@ -81,7 +84,7 @@ class Config:
     """lagnet-foresight: the value C̄_ξ(s) starts at in every state."""
     foresight_learning_rate: float = 1e-3
     """lagnet-foresight: Adam's step size for the regression of C̄_ξ."""
-    scale_init: float = 200.0
+    scale_init: float = 20.0
     """lagnet-foresight: the value the scale β starts at; λ_ξ(s) = β C̄_ξ(s)."""
     scale_gain: float = 0.05
     """lagnet-foresight: log β moves by this much an epoch for each relative excess of the cost over d."""
@@ -118,8 +121,8 @@ class Config:
     """trpo-lag, cpo, scpo: multiple of the identity added to the Fisher matrix."""
     fisher_every: int = 4
     """trpo-lag, cpo, scpo: every how-many-th sample goes into the Fisher products."""
-    cpo_constraint: Literal["episode", "step"] = "episode"
-    """cpo, scpo: unit of the constraint in the step: per episode as in OmniSafe, or per step."""
+    cpo_form: Literal["paper", "omnisafe"] = "paper"
+    """cpo, scpo: the step as the paper derives it, or with OmniSafe's sign and unit of the constraint."""
 
     checkpoint_every: int = 10
     """Epochs between two checkpoints. One is also written at the start, at the end and on Ctrl-C."""

@@ -53,7 +53,7 @@ class ExportConfig:
     episodes: int = 300
     """Deterministic closed-loop episodes that give the bundle its figures and its threshold."""
     threads: int = 2
-    """Threads for physics and for torch."""
+    """Threads for physics."""
 
 
 class TrainedRun:
@@ -120,7 +120,7 @@ class TrainedRun:
         network = self.algorithm.multiplier_network()
         if network is None:
             return policy, onnx_graph.constant_graph(shape.inputs, NO_NETWORK)
-        xi = network.parameters.detach().numpy()[0]
+        xi = network.parameters.detach().numpy()
         multiplier = onnx_graph.multiplier_graph(xi, learner.critic_shape, mean, inverse, network.scale)
         return policy, multiplier
 
@@ -139,7 +139,7 @@ def export(config: ExportConfig) -> Manifest:
             onnxruntime differ.
         BundleError: if the bundle cannot be written.
     """
-    torch.set_num_threads(config.threads)
+    torch.set_num_threads(1)
     run = TrainedRun(config.run)
     level = _level(run)
     policy, multiplier = run.graphs()

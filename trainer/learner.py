@@ -1,5 +1,7 @@
 """What every algorithm learns with: the parameters, their optimisers and the epoch's batch."""
 
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,18 +13,19 @@ from torch import Tensor
 from trainer.advantage import gae, successor_values
 from trainer.config import Config
 from trainer.errors import CheckpointError, NonFiniteError
-from trainer.networks import Shape, gaussian, initial, log_probability, stacked
+from trainer.networks import Shape, fast_mlp, gaussian, initial, log_probability
 from trainer.normaliser import Normaliser
 from trainer.rollout import Trajectory
 
 ADAM = ("step", "exp_avg", "exp_avg_sq")
+Figures = dict[str, float]
 REWARD, COST = 0, 1
 """Rows of the critics' parameters."""
 
 
 @dataclass
 class Batch:
-    """One epoch as samples in the order of time, B = T · N.
+    """One epoch as samples in random order, B = T · N.
 
     Attributes:
         observation: normalised [B, n].
@@ -34,7 +37,9 @@ class Batch:
         cost_advantage: A_c, mean 0, its own scale kept [B].
         targets: of the reward critic and the cost critic [2, B].
         cost: C(s, a, s') [B].
-        horizon: T.
+        order: where each sample stands in the trajectory's row-major order [B].
+        trajectory: what the samples come from.
+        schedule: for each pass, the minibatches in the order they are taken, each a slice of the samples.
     """
 
     observation: Tensor
@@ -46,12 +51,9 @@ class Batch:
     cost_advantage: Tensor
     targets: Tensor
     cost: Tensor
+    order: npt.NDArray[np.int64]
     trajectory: Trajectory
-
-    @property
-    def size(self) -> int:
-        """B."""
-        return self.observation.shape[0]
+    schedule: list[list[slice]]
 
 
 class Learner:
@@ -77,7 +79,8 @@ class Learner:
         self.optimisers: dict[str, torch.optim.Adam] = {}
         self.actor = self.add("actor", actor, config.learning_rate)
         self.critics = self.add("critics", critics, config.critic_learning_rate)
-        self.progress = 0.0
+        # One thread a job: jobs this small lose more to waiting for each other than they gain.
+        self._pool = ThreadPoolExecutor(1, initializer=torch.set_num_threads, initargs=(1,))
 
     def add(self, name: str, parameters: Tensor, learning_rate: float) -> Tensor:
         """Registers parameters to be optimised by Adam and kept in checkpoints."""
@@ -95,7 +98,6 @@ class Learner:
 
     def start_epoch(self, progress: float) -> None:
         """Sets the actor's step size for the share of the run that is done [0, 1)."""
-        self.progress = progress
         self.optimisers["actor"].param_groups[0]["lr"] = self.config.learning_rate * (1 - progress)
 
     def policy(self, observation: Tensor) -> tuple[Tensor, Tensor]:
@@ -104,7 +106,7 @@ class Learner:
 
     def values(self, observation: Tensor) -> Tensor:
         """Reward and cost values [2, B] of normalised observations [B, n]."""
-        return stacked(self.critics, observation, self.critic_shape)
+        return torch.stack([fast_mlp(row, observation, self.critic_shape)[:, 0] for row in self.critics])
 
     def batch(self, trajectory: Trajectory, cost_discount: float) -> Batch:
         """Turns a trajectory into samples with advantages and targets.
@@ -123,12 +125,13 @@ class Learner:
             if not np.isfinite(getattr(trajectory, name)).all():
                 raise NonFiniteError(f"the environment returned a {name} that is not finite")
         T, N = trajectory.reward.shape
-        seen = self.normalised(trajectory.observation)
-        final = self.normalised(trajectory.final_observation)
-        with torch.no_grad():
-            values = self.values(seen).view(2, T + 1, N).numpy()
-            final_values = self.values(final).numpy()
         config = self.config
+        with torch.no_grad():
+            seen = self.normalised(trajectory.observation)
+            values = self.values(seen).view(2, T + 1, N).numpy()
+            final_values = self.values(self.normalised(trajectory.final_observation)).numpy()
+        order = self.rng.permutation(T * N)
+        rows = torch.from_numpy(order)
         advantages, targets = [], []
         for k, signal, discount in (
             (REWARD, trajectory.reward, config.discount),
@@ -136,13 +139,13 @@ class Learner:
         ):
             after = successor_values(values[k], trajectory.ended, trajectory.terminated, final_values[k])
             advantage = gae(signal, values[k], after, trajectory.ended, discount, config.gae)
-            advantages.append(torch.from_numpy(advantage.reshape(-1)))
-            targets.append(torch.from_numpy((advantage + values[k][:-1]).reshape(-1)))
+            advantages.append(torch.from_numpy(advantage.reshape(-1)[order]))
+            targets.append(torch.from_numpy((advantage + values[k][:-1]).reshape(-1)[order]))
         reward_advantage, cost_advantage = advantages
-        action, mean = _flat(trajectory.action), _flat(trajectory.mean)
+        action, mean = _flat(trajectory.action)[rows], _flat(trajectory.mean)[rows]
         log_std = self.actor.detach()[self.actor_shape.size :].clone()
         return Batch(
-            observation=seen[: T * N],
+            observation=seen[rows],
             action=action,
             mean=mean,
             log_std=log_std,
@@ -150,9 +153,34 @@ class Learner:
             reward_advantage=(reward_advantage - reward_advantage.mean()) / (reward_advantage.std() + 1e-8),
             cost_advantage=cost_advantage - cost_advantage.mean(),
             targets=torch.stack(targets),
-            cost=_flat(trajectory.cost[..., None])[:, 0],
+            cost=torch.from_numpy(trajectory.cost.reshape(-1)[order]),
+            order=order,
             trajectory=trajectory,
+            schedule=self._schedule(T * N),
         )
+
+    def _schedule(self, samples: int) -> list[list[slice]]:
+        """The minibatches of each pass, drawn at once so that jobs side by side share them."""
+        size = self.config.minibatch
+        blocks = [slice(start, start + size) for start in range(0, samples, size)]
+        return [[blocks[i] for i in self.rng.permutation(len(blocks))] for _ in range(self.config.passes)]
+
+    def side_by_side(self, first: Callable[[], Figures], second: Callable[[], Figures]) -> Figures:
+        """Runs two jobs that share no parameters, on two threads if the run has them.
+
+        The result does not depend on the number of threads.
+
+        Args:
+            first: a job that returns figures to log.
+            second: another.
+
+        Returns:
+            The figures of both.
+        """
+        if self.config.threads == 1:
+            return first() | second()
+        pending = self._pool.submit(second)
+        return first() | pending.result()
 
     def normalised(self, observation: npt.NDArray[np.float32]) -> Tensor:
         """Raw observations [..., n] → normalised tensor [B, n]."""

@@ -1,12 +1,12 @@
 """The networks, as pure functions of flat parameter vectors.
 
 All of them are perceptrons with two hidden layers of 64 tanh units. A network's parameters are one vector,
-so that an optimiser, a trust region and a checkpoint each handle one tensor; several networks of one shape
-are a matrix with a network a row, and are evaluated together.
+so that an optimiser, a trust region and a checkpoint each handle one tensor.
 """
 
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import torch
@@ -59,7 +59,7 @@ def initial(shape: Shape, rng: np.random.Generator, output_gain: float) -> Tenso
 
 
 def mlp(theta: Tensor, x: Tensor, shape: Shape) -> Tensor:
-    """One network on a batch of inputs.
+    """One network on a batch of inputs, differentiable any number of times.
 
     Args:
         theta: parameters [P].
@@ -75,22 +75,49 @@ def mlp(theta: Tensor, x: Tensor, shape: Shape) -> Tensor:
     return torch.addmm(b3, h, w3.view(HIDDEN, -1))
 
 
-def stacked(theta: Tensor, x: Tensor, shape: Shape) -> Tensor:
-    """K networks of one shape on the same batch of inputs.
+def fast_mlp(theta: Tensor, x: Tensor, shape: Shape) -> Tensor:
+    """What mlp computes, differentiable once, with respect to theta, in under half its time."""
+    result: Tensor = _FastMlp.apply(theta, x, shape)  # type: ignore[no-untyped-call]
+    return result
 
-    Args:
-        theta: parameters [K, P].
-        x: inputs [B, n].
-        shape: the layer sizes, with one output.
 
-    Returns:
-        Outputs [K, B].
+class _FastMlp(torch.autograd.Function):
+    """Forward and backward written out.
+
+    tanh(x) = 2 σ(2x) − 1, for torch's sigmoid takes a third of the time of its tanh; everything in place;
+    the gradient goes straight into one vector, and none is computed for the inputs.
     """
-    k = theta.shape[0]
-    w1, b1, w2, b2, w3, b3 = torch.split(theta, shape.splits, dim=1)
-    h = torch.baddbmm(b1.unsqueeze(1), x.expand(k, *x.shape), w1.view(k, -1, HIDDEN)).tanh()
-    h = torch.baddbmm(b2.unsqueeze(1), h, w2.view(k, HIDDEN, HIDDEN)).tanh()
-    return torch.baddbmm(b3.unsqueeze(1), h, w3.view(k, HIDDEN, -1)).squeeze(-1)
+
+    @staticmethod
+    def forward(ctx: Any, theta: Tensor, x: Tensor, shape: Shape) -> Tensor:
+        w1, b1, w2, b2, w3, b3 = torch.split(theta, shape.splits)
+        first = _tanh_(torch.addmm(b1, x, w1.view(-1, HIDDEN)))
+        second = _tanh_(torch.addmm(b2, first, w2.view(HIDDEN, HIDDEN)))
+        ctx.save_for_backward(theta, x, first, second)
+        ctx.shape = shape
+        return torch.addmm(b3, second, w3.view(HIDDEN, -1))
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Any) -> Any:
+        theta, x, first, second = ctx.saved_tensors
+        shape: Shape = ctx.shape
+        _, _, w2, _, w3, _ = torch.split(theta, shape.splits)
+        result = torch.empty_like(theta)
+        parts = torch.split(result, shape.splits)
+        ones = x.new_ones(x.shape[0])
+        error = gradients[0]
+        for k, (inputs, weight) in enumerate(((second, w3), (first, w2), (x, None))):
+            gradient, bias = parts[4 - 2 * k], parts[5 - 2 * k]
+            torch.mm(inputs.t(), error, out=gradient.view(inputs.shape[1], -1))
+            torch.mv(error.t(), ones, out=bias)
+            if weight is not None:
+                error = torch.ops.aten.tanh_backward(error @ weight.view(HIDDEN, -1).t(), inputs)
+        return result, None, None
+
+
+def _tanh_(x: Tensor) -> Tensor:
+    """The hyperbolic tangent, in place."""
+    return x.mul_(2).sigmoid_().mul_(2).sub_(1)
 
 
 def gaussian(theta: Tensor, x: Tensor, shape: Shape) -> tuple[Tensor, Tensor]:
@@ -104,7 +131,7 @@ def gaussian(theta: Tensor, x: Tensor, shape: Shape) -> tuple[Tensor, Tensor]:
     Returns:
         Mean [B, a] and log standard deviation [a].
     """
-    return mlp(theta[: shape.size], x, shape), theta[shape.size :]
+    return fast_mlp(theta[: shape.size], x, shape), theta[shape.size :]
 
 
 def log_probability(mean: Tensor, log_std: Tensor, action: Tensor) -> Tensor:

@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 import torch
 import tyro
+from gymnasium import Space
+from gymnasium.spaces import Box
 from gymnasium.vector import VectorEnv
 from rich.console import Console
 
@@ -69,6 +71,12 @@ def make_environments(config: Config) -> Environments:
         raise ConfigError(f"cannot make the task {config.task!r}: {error}") from error
 
 
+def _box(space: Space[Any]) -> Box:
+    if not isinstance(space, Box) or len(space.shape) != 1:
+        raise ConfigError(f"the task must have vectors for observations and actions, not {space}")
+    return space
+
+
 class Run:
     """One run: everything that moves from epoch to epoch, and its folder."""
 
@@ -76,8 +84,8 @@ class Run:
         self.config = config
         self.folder = folder
         self.rng = np.random.default_rng(config.seed)
-        seen: Any = env.single_observation_space
-        self.bounds: Any = env.single_action_space
+        self.bounds = _box(env.single_action_space)
+        seen = _box(env.single_observation_space)
         self.learner = Learner(config, seen.shape[0], self.bounds.shape[0], self.rng)
         self.algorithm: Algorithm = ALGORITHMS[config.algorithm](self.learner)
         self.rollout = Rollout(env, config.horizon, config.episode_steps, config.seed, self.rng)
@@ -133,8 +141,8 @@ class Run:
             "progress_bytes": written,
             "rng": self.rng.bit_generator.state,
             "algorithm": self.algorithm.state(),
-            "action_low": np.asarray(self.bounds.low).tolist(),
-            "action_high": np.asarray(self.bounds.high).tolist(),
+            "action_low": self.bounds.low.tolist(),
+            "action_high": self.bounds.high.tolist(),
         }
         checkpoint.write(self.folder, arrays, facts)
 
@@ -183,7 +191,7 @@ def train(
     """
     started = perf_counter()
     config, folder, resumed = prepare(config)
-    torch.set_num_threads(config.threads)
+    torch.set_num_threads(1)  # jobs run side by side instead, see Learner
     with closing(prepare_environments(config.algorithm, make(config))) as env:
         run = Run(config, folder, env)
         length = run.load() if resumed and (folder / checkpoint.FILE).exists() else 0

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from trainer.learner import Batch, Learner
-from trainer.networks import gaussian, kl_divergence, log_probability
+from trainer.networks import kl_divergence, log_probability, mlp
 
 Product = Callable[[Tensor], Tensor]
 
@@ -28,7 +28,8 @@ def fisher(learner: Learner, batch: Batch) -> Product:
     config = learner.config
     theta = learner.actor
     observation = batch.observation[:: config.fisher_every]
-    mean, log_std = gaussian(theta, observation, learner.actor_shape)
+    shape = learner.actor_shape
+    mean, log_std = mlp(theta[: shape.size], observation, shape), theta[shape.size :]
     divergence = kl_divergence(mean.detach(), log_std.detach(), mean, log_std)
     (gradient,) = torch.autograd.grad(divergence, theta, create_graph=True)
 

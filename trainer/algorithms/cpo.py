@@ -1,5 +1,6 @@
 """CPO [Achiam 2017]: a trust-region step under a linearised cost constraint."""
 
+import math
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -37,7 +38,7 @@ class Quadratic:
 
     Attributes:
         q: gᵀH⁻¹g.
-        r: gᵀH⁻¹b.
+        r: −gᵀH⁻¹b; the paper minimises, so its g is our −g.
         s: bᵀH⁻¹b.
         c: the constraint's value at Δ = 0.
         delta: δ, radius of the trust region.
@@ -86,10 +87,9 @@ def weights(problem: Quadratic) -> tuple[float, float]:
     if problem.case is Case.RECOVERY:
         return 0.0, -((2 * delta / (s + TINY)) ** 0.5)
     A, B = problem.reward_curvature, max(problem.room, TINY)
-    split = r / c if abs(c) > TINY else float("inf") * (1 if r * c >= 0 else -1)
-    a_range, b_range = (
-        ((split, float("inf")), (0.0, split)) if c >= 0 else ((0.0, split), (split, float("inf")))
-    )
+    side = 1 if c >= 0 else -1
+    split = r / c if abs(c) > TINY else math.copysign(math.inf, r * side)
+    a_range, b_range = ((split, math.inf), (0.0, split)) if c >= 0 else ((0.0, split), (split, math.inf))
     at_a = _project((A / B) ** 0.5, *a_range)
     at_b = _project((q / (2 * delta)) ** 0.5, *b_range)
     value_a = -0.5 * (A / (at_a + TINY) + B * at_a) - r * c / (s + TINY)
@@ -107,27 +107,26 @@ def _project(value: float, low: float, high: float) -> float:
 class CPO(Algorithm):
     """One constrained trust-region step an epoch, with a line search that checks the surrogates.
 
-    c = J_c − d as in OmniSafe; with cpo_constraint "step" it is (J_c − d) / H, which is in the units of the
-    surrogate E[r A_c], a mean over steps (as in the CPO authors' own code).
+    In the paper's form c = (J_c − d) / H, in the units of the surrogate E[r A_c], which is a mean over steps.
+    OmniSafe's form differs in two respects: c = J_c − d, and r has the other sign (it puts the ascent
+    direction where the paper has the gradient of what is minimised).
     """
 
     def update(self, batch: Batch, figures: Figures) -> dict[str, float]:
         """One update on one epoch, see Algorithm.update."""
         config = self.config
-        c = self.episode_cost(figures) - config.cost_limit
-        if config.cpo_constraint == "step":
-            c /= config.episode_steps
-        step = cpo_update(self.learner, batch, c)
-        return step | {"critic_loss": fit_critics(self.learner, batch)}
+        excess = self.episode_cost(figures) - config.cost_limit
+        step = cpo_update(self.learner, batch, excess)
+        return step | fit_critics(self.learner, batch)
 
 
-def cpo_update(learner: Learner, batch: Batch, c: float) -> dict[str, float]:
+def cpo_update(learner: Learner, batch: Batch, excess: float) -> dict[str, float]:
     """CPO's step.
 
     Args:
         learner: whose actor moves.
         batch: the epoch.
-        c: the constraint's value at the acting policy; feasible if ≤ 0.
+        excess: by how much the acting policy's episode cost is above its limit.
 
     Returns:
         Surrogate before the step, the constraint's multiplier ν / λ, the case, share taken, divergence.
@@ -136,15 +135,18 @@ def cpo_update(learner: Learner, batch: Batch, c: float) -> dict[str, float]:
         NonFiniteError: if a surrogate or the step is not finite.
     """
     config = learner.config
+    paper = config.cpo_form == "paper"
+    c = excess / config.episode_steps if paper else excess
     before = surrogates(learner, batch, batch.reward_advantage)
     (g,) = torch.autograd.grad(before.reward, learner.actor, retain_graph=True)
     (b,) = torch.autograd.grad(before.cost, learner.actor)
+    reward, cost = before.reward.item(), before.cost.item()
     product = fisher(learner, batch)
     x = conjugate_gradient(product, g, config.cg_iterations)
     p = conjugate_gradient(product, b, config.cg_iterations)
     problem = Quadratic(
         q=float(x @ product(x)),
-        r=float(g @ p),
+        r=float(-g @ p if paper else g @ p),
         s=float(b @ p),
         c=c,
         delta=config.trust_kl,
@@ -154,16 +156,16 @@ def cpo_update(learner: Learner, batch: Batch, c: float) -> dict[str, float]:
     step: Tensor = along_x * x + along_p * p
     check_finite(
         {
-            "policy surrogate": float(before.reward),
-            "cost surrogate": float(before.cost),
+            "policy surrogate": reward,
+            "cost surrogate": cost,
             "trust-region step": float(step.sum()),
         }
     )
     case = problem.case
 
     def accept(found: Surrogates) -> bool:
-        improved = case <= Case.INFEASIBLE or bool(found.reward >= before.reward)
-        cheaper = bool(found.cost - before.cost <= max(-c, 0.0))
+        improved = case <= Case.INFEASIBLE or bool(found.reward >= reward)
+        cheaper = bool(found.cost - cost <= max(-c, 0.0))
         return improved and cheaper and bool(found.divergence <= config.trust_kl)
 
     share, kl = line_search(learner, batch, batch.reward_advantage, step, accept, LINE_SEARCH)
@@ -171,7 +173,7 @@ def cpo_update(learner: Learner, batch: Batch, c: float) -> dict[str, float]:
     return {
         "multiplier": multiplier,
         "case": float(case),
-        "policy_loss": -float(before.reward),
+        "policy_loss": -reward,
         "step_share": share,
         "kl": kl,
     }

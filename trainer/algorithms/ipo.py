@@ -53,10 +53,10 @@ class IPO(Algorithm):
             advantage = lagrangian_advantage(batch, penalty)
             return {"multiplier": penalty} | clipped_update(self.learner, batch, advantage)
 
-        def loss(ratio: Tensor, rows: Tensor) -> Tensor:
-            change = ((ratio - 1) * batch.cost_advantage[rows]).mean()
+        def loss(ratio: Tensor, block: slice) -> Tensor:
+            change = ((ratio - 1) * batch.cost_advantage[block]).mean()
             excess = cost + config.episode_steps * change - config.cost_limit
-            reward = clipped_surrogate(ratio, batch.reward_advantage[rows], config.clip)
+            reward = clipped_surrogate(ratio, batch.reward_advantage[block], config.clip)
             return reward + log_barrier(excess, config.ipo_sharpness)
 
         slope = min(config.ipo_sharpness, 1 / (config.ipo_sharpness * max(1e-8, config.cost_limit - cost)))

@@ -1,5 +1,7 @@
 """PPO-Lagnet: a Lagrange multiplier for every state (the paper, §3.3)."""
 
+from typing import Literal
+
 import torch
 from torch import Tensor
 
@@ -12,18 +14,30 @@ from trainer.losses import clipped_surrogate, cost_surrogate, multiplier_loss
 from trainer.rollout import Figures
 
 
-def statewise_update(learner: Learner, batch: Batch, multiplier: Tensor) -> dict[str, float]:
-    """proximal_update with eq. 14 for multipliers λ_ξ(s) [B].
+def statewise_update(
+    learner: Learner, batch: Batch, multiplier: Tensor, rescale: Literal["mean", "state"]
+) -> dict[str, float]:
+    """proximal_update with eq. 14, rescaled.
 
-    Eq. 14 is divided by 1 + mean λ as a whole: Adam does not see a common factor, the gradient clip does.
+    Args:
+        learner: whose actor and critics move.
+        batch: the epoch.
+        multiplier: λ_ξ(s) [B].
+        rescale: "mean" divides eq. 14 as a whole by 1 + mean λ (Adam does not see a common factor, the
+            gradient clip does); "state" divides each state's term by its own 1 + λ_ξ(s), which keeps the best
+            action of every state, and keeps the few states of large λ from deciding the whole step.
+
+    Returns:
+        Figures to log.
     """
     clip = learner.config.clip
-    whole = 1 + multiplier.mean()
+    weight = 1 / (1 + (multiplier if rescale == "state" else multiplier.mean().expand_as(multiplier)))
+    advantage = weight * batch.reward_advantage
+    penalty = weight * multiplier
 
-    def loss(ratio: Tensor, rows: Tensor) -> Tensor:
-        reward = clipped_surrogate(ratio, batch.reward_advantage[rows], clip)
-        cost = cost_surrogate(ratio, batch.cost_advantage[rows], multiplier[rows])
-        return (reward + cost) / whole
+    def loss(ratio: Tensor, block: slice) -> Tensor:
+        cost = cost_surrogate(ratio, batch.cost_advantage[block], penalty[block])
+        return clipped_surrogate(ratio, advantage[block], clip) + cost
 
     return proximal_update(learner, batch, loss)
 
@@ -45,18 +59,17 @@ class Lagnet(Algorithm):
             "multiplier": float(multiplier.mean()),
             "multiplier_max": float(multiplier.max()),
             "multiplier_loss": ascent,
-        } | statewise_update(self.learner, batch, multiplier)
+        } | statewise_update(self.learner, batch, multiplier, self.config.rescale or "mean")
 
     def _ascend(self, batch: Batch) -> float:
         """Passes of minibatch ascent on eq. 15; returns the mean loss of the last one."""
         config = self.config
         mean = 0.0
-        for _ in range(config.multiplier_passes):
-            order = torch.from_numpy(self.learner.rng.permutation(batch.size))
+        for blocks in batch.schedule[: config.multiplier_passes]:
             losses = []
-            for rows in torch.split(order, config.minibatch):
-                multiplier = self.network(batch.observation[rows])
-                loss = multiplier_loss(multiplier, batch.cost[rows], config.state_limit)
+            for block in blocks:
+                multiplier = self.network(batch.observation[block])
+                loss = multiplier_loss(multiplier, batch.cost[block], config.state_limit)
                 (gradient,) = torch.autograd.grad(loss, self.network.parameters)
                 self.learner.descend("multiplier", gradient)
                 losses.append(loss.detach())

@@ -8,7 +8,6 @@ the one scale β = 1/κ is moved until the episode cost meets its limit. λ_ξ(s
 
 import math
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -48,7 +47,7 @@ class LagnetForesight(Algorithm):
             "multiplier_max": float(multiplier.max()),
             "scale": self.network.scale,
             "multiplier_loss": loss,
-        } | statewise_update(self.learner, batch, multiplier)
+        } | statewise_update(self.learner, batch, multiplier, self.config.rescale or "state")
 
     def cost_now(self, figures: Figures) -> float:
         """What an episode of the latest epoch's steps costs: without the delay of finished episodes."""
@@ -59,11 +58,10 @@ class LagnetForesight(Algorithm):
         config = self.config
         targets = self.targets(batch)
         mean = 0.0
-        for _ in range(config.multiplier_passes):
-            order = torch.from_numpy(self.learner.rng.permutation(batch.size))
+        for blocks in batch.schedule[: config.multiplier_passes]:
             losses = []
-            for rows in torch.split(order, config.minibatch):
-                loss = (self.network.raw(batch.observation[rows]) - targets[rows]).square().mean()
+            for block in blocks:
+                loss = (self.network.raw(batch.observation[block]) - targets[block]).square().mean()
                 (gradient,) = torch.autograd.grad(loss, self.network.parameters)
                 self.learner.descend("multiplier", gradient)
                 losses.append(loss.detach())
@@ -76,12 +74,12 @@ class LagnetForesight(Algorithm):
         config, trajectory = self.config, batch.trajectory
         T, N = trajectory.cost.shape
         with torch.no_grad():
-            last = self.network.raw(self.learner.normalised(trajectory.observation[-1]))
-            values = torch.cat([self.network.raw(batch.observation), last]).view(T + 1, N).numpy()
+            seen = self.learner.normalised(trajectory.observation)
+            values = self.network.raw(seen).view(T + 1, N).numpy()
             final = self.network.raw(self.learner.normalised(trajectory.final_observation)).numpy()
         after = successor_values(values, trajectory.ended, trajectory.terminated, final)
         ahead = gae(trajectory.cost, values, after, trajectory.ended, config.foresight, config.gae)
-        return torch.from_numpy(np.asarray(ahead + values[:-1]).reshape(-1))
+        return torch.from_numpy((ahead + values[:-1]).reshape(-1)[batch.order])
 
     def multiplier_network(self) -> MultiplierNetwork:
         """λ_ξ."""

@@ -6,7 +6,7 @@ from torch import Tensor
 from torch.nn.functional import softplus
 
 from trainer.learner import Learner
-from trainer.networks import initial, stacked
+from trainer.networks import fast_mlp, initial
 
 
 class MultiplierNetwork:
@@ -15,7 +15,7 @@ class MultiplierNetwork:
     f_ξ's last layer starts near zero, with a bias that puts the softplus at `start` in every state.
 
     Attributes:
-        parameters: ξ [1, P].
+        parameters: ξ [P].
         scale: the factor; 1 unless an algorithm moves it.
     """
 
@@ -23,12 +23,12 @@ class MultiplierNetwork:
         self._shape = learner.critic_shape
         xi = initial(self._shape, learner.rng, 0.01)
         xi[-1] = start + math.log(-math.expm1(-start)) if start > 0 else -20.0
-        self.parameters = learner.add("multiplier", xi[None], learning_rate)
+        self.parameters = learner.add("multiplier", xi, learning_rate)
         self.scale = 1.0
 
     def raw(self, observation: Tensor) -> Tensor:
         """softplus(f_ξ(s)) [B] of normalised observations [B, n]."""
-        return softplus(stacked(self.parameters, observation, self._shape)[0])
+        return softplus(fast_mlp(self.parameters, observation, self._shape)[:, 0])
 
     def __call__(self, observation: Tensor) -> Tensor:
         """λ_ξ(s) [B] of normalised observations [B, n]."""

@@ -6,14 +6,14 @@ import torch
 from torch import Tensor
 
 from trainer.algorithms.base import Algorithm
-from trainer.critics import check_finite, critic_step
+from trainer.critics import check_finite, fit_critics
 from trainer.learner import Batch, Learner
 from trainer.losses import clipped_surrogate
 from trainer.networks import kl_divergence, log_probability
 from trainer.rollout import Figures
 
-PolicyLoss = Callable[[Tensor, Tensor], Tensor]
-"""(ratio [b], sample indices [b]) → scalar to minimise."""
+PolicyLoss = Callable[[Tensor, slice], Tensor]
+"""(ratio [b], the samples it belongs to) → scalar to minimise."""
 
 
 class PPO(Algorithm):
@@ -25,23 +25,21 @@ class PPO(Algorithm):
 
 
 def clipped_update(learner: Learner, batch: Batch, advantage: Tensor) -> dict[str, float]:
-    """proximal_update with PPO's clipped surrogate of an advantage [B]."""
+    """The update with PPO's clipped surrogate of an advantage [B]."""
 
-    def loss(ratio: Tensor, rows: Tensor) -> Tensor:
-        return clipped_surrogate(ratio, advantage[rows], learner.config.clip)
+    def loss(ratio: Tensor, block: slice) -> Tensor:
+        return clipped_surrogate(ratio, advantage[block], learner.config.clip)
 
     return proximal_update(learner, batch, loss)
 
 
 def proximal_update(learner: Learner, batch: Batch, policy_loss: PolicyLoss) -> dict[str, float]:
-    """Passes of minibatch descent on a policy loss and on the critics' loss.
-
-    Ends early once the policy has moved by more than kl_stop in a pass (mean over its minibatches).
+    """Passes of minibatch descent on a policy loss, beside the critics' regression.
 
     Args:
         learner: whose actor and critics move.
         batch: the epoch.
-        policy_loss: of the ratio r = π_θ(a|s) / π_old(a|s) [b] and the samples' indices [b].
+        policy_loss: of the ratio r = π_θ(a|s) / π_old(a|s) [b] and the samples it belongs to.
 
     Returns:
         Losses, divergence and passes taken.
@@ -49,35 +47,33 @@ def proximal_update(learner: Learner, batch: Batch, policy_loss: PolicyLoss) -> 
     Raises:
         NonFiniteError: if a loss is not finite; names it.
     """
+    return learner.side_by_side(
+        lambda: improve_policy(learner, batch, policy_loss), lambda: fit_critics(learner, batch)
+    )
+
+
+def improve_policy(learner: Learner, batch: Batch, policy_loss: PolicyLoss) -> dict[str, float]:
+    """The actor's part of proximal_update.
+
+    Ends early once a pass has moved the policy by more than kl_stop (mean over its minibatches).
+    """
     config = learner.config
-    order = torch.from_numpy(learner.rng.permutation(batch.size))
-    blocks = [
-        (
-            rows,
-            batch.observation[rows],
-            batch.action[rows],
-            batch.log_prob[rows],
-            batch.mean[rows],
-            batch.targets[:, rows],
-        )
-        for rows in torch.split(order, config.minibatch)
-    ]
     figures: dict[str, float] = {}
-    for done in range(1, config.passes + 1):
-        totals = torch.zeros(3)
-        for i in learner.rng.permutation(len(blocks)):
-            rows, x, action, old, old_mean, targets = blocks[i]
-            mean, log_std = learner.policy(x)
-            ratio = (log_probability(mean, log_std, action) - old).exp()
-            loss = policy_loss(ratio, rows) - config.entropy * log_std.sum()
+    for done, blocks in enumerate(batch.schedule, 1):
+        totals = torch.zeros(2)
+        for block in blocks:
+            mean, log_std = learner.policy(batch.observation[block])
+            log_prob = log_probability(mean, log_std, batch.action[block])
+            ratio = (log_prob - batch.log_prob[block]).exp()
+            loss = policy_loss(ratio, block) - config.entropy * log_std.sum()
             (gradient,) = torch.autograd.grad(loss, learner.actor)
             with torch.no_grad():
-                divergence = kl_divergence(old_mean, batch.log_std, mean, log_std)
+                divergence = kl_divergence(batch.mean[block], batch.log_std, mean, log_std)
             learner.descend("actor", gradient)
-            totals += torch.stack([loss.detach(), critic_step(learner, x, targets), divergence])
-        policy, critic, kl = (totals / len(blocks)).tolist()
-        figures = {"policy_loss": policy, "critic_loss": critic, "kl": kl, "passes": float(done)}
-        check_finite({"policy loss": policy, "critic loss": critic, "KL divergence": kl})
+            totals += torch.stack([loss.detach(), divergence])
+        policy, kl = (totals / len(blocks)).tolist()
+        figures = {"policy_loss": policy, "kl": kl, "passes": float(done)}
+        check_finite({"policy loss": policy, "KL divergence": kl})
         if kl > config.kl_stop:
             break
     return figures

@@ -67,7 +67,7 @@ class MaximumCost(VectorWrapper):
 
 
 class SCPO(Algorithm):
-    """CPO's step with c = E[largest cost of an episode] − w, undiscounted."""
+    """CPO's step with E[largest cost of an episode] ≤ w as its constraint, undiscounted."""
 
     @property
     def cost_discount(self) -> float:
@@ -76,8 +76,6 @@ class SCPO(Algorithm):
 
     def update(self, batch: Batch, figures: Figures) -> dict[str, float]:
         """One update on one epoch, see Algorithm.update."""
-        c = self.episode_cost(figures) - self.config.state_limit
-        if self.config.cpo_constraint == "step":
-            c /= self.config.episode_steps
-        step = cpo_update(self.learner, batch, c)
-        return step | {"critic_loss": fit_critics(self.learner, batch)}
+        excess = self.episode_cost(figures) - self.config.state_limit
+        step = cpo_update(self.learner, batch, excess)
+        return step | fit_critics(self.learner, batch)

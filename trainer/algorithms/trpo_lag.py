@@ -25,7 +25,7 @@ class TRPOLag(Algorithm):
         """One update on one epoch, see Algorithm.update."""
         multiplier = self.dual.update(self.episode_cost(figures), self.config.cost_limit)
         step = trpo_update(self.learner, batch, lagrangian_advantage(batch, multiplier))
-        return {"multiplier": multiplier} | step | {"critic_loss": fit_critics(self.learner, batch)}
+        return {"multiplier": multiplier} | step | fit_critics(self.learner, batch)
 
     def state(self) -> Numbers:
         """The dual's."""
@@ -51,16 +51,17 @@ def trpo_update(learner: Learner, batch: Batch, advantage: Tensor) -> dict[str, 
         NonFiniteError: if the surrogate or the step is not finite.
     """
     config = learner.config
-    before = surrogates(learner, batch, advantage).reward
-    (g,) = torch.autograd.grad(before, learner.actor)
+    surrogate = surrogates(learner, batch, advantage).reward
+    (g,) = torch.autograd.grad(surrogate, learner.actor)
+    before = surrogate.item()
     product = fisher(learner, batch)
     x = conjugate_gradient(product, g, config.cg_iterations)
     curvature = x @ product(x)
     step = (2 * config.trust_kl / (curvature + 1e-8)).sqrt() * x
-    check_finite({"policy surrogate": float(before), "trust-region step": float(step.sum())})
+    check_finite({"policy surrogate": before, "trust-region step": float(step.sum())})
 
     def accept(found: Surrogates) -> bool:
         return bool(found.reward >= before) and bool(found.divergence <= config.trust_kl)
 
     share, kl = line_search(learner, batch, advantage, step, accept, LINE_SEARCH)
-    return {"policy_loss": -float(before), "step_share": share, "kl": kl}
+    return {"policy_loss": -before, "step_share": share, "kl": kl}

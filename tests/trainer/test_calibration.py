@@ -1,0 +1,46 @@
+import numpy as np
+import pytest
+from scipy.stats import binom
+
+from trainer.calibration import calibrate, rank, scores
+
+
+@pytest.mark.parametrize("n", [1, 58, 59, 92, 93, 200, 1000])
+def test_rank_is_the_largest_the_binomial_law_allows(n):
+    allowed = [k for k in range(1, n + 1) if binom.cdf(k - 1, n, 0.05) <= 0.05]
+    assert rank(n) == max(allowed, default=0)
+
+
+def test_the_published_sample_sizes():
+    assert [rank(n) for n in (58, 59, 92, 93)] == [0, 1, 1, 2]
+
+
+def test_scores_look_no_later_than_the_lead_before_the_first_violation():
+    multiplier = np.tile(np.arange(100.0)[:, None], (1, 3))
+    cost = np.zeros((100, 3))
+    cost[50, 0] = cost[70, 0] = 0.1  # first violation in step 50: 20 steps before is step 30
+    cost[5, 1] = 0.1  # before any lead
+    np.testing.assert_array_equal(scores(multiplier, cost), [30.0, -np.inf])
+
+
+def test_enough_episodes_give_a_threshold_that_catches_the_worst_of_them():
+    rng = np.random.default_rng(0)
+    multiplier = np.repeat(rng.uniform(1, 2, (1, 80)), 60, axis=0)
+    cost = np.zeros((60, 80))
+    cost[40] = 0.01
+    threshold = calibrate(multiplier, cost)
+    assert threshold.value < multiplier[0].min()
+    assert threshold.value == pytest.approx(multiplier[0].min())
+    assert "exact binomial" in threshold.source
+
+
+def test_too_few_violations_leave_the_gate_open():
+    threshold = calibrate(np.ones((60, 30)), np.zeros((60, 30)))
+    assert threshold.value == 0.0
+    assert "always open: 0 of 30" in threshold.source
+
+
+def test_a_multiplier_that_announces_nothing_leaves_the_gate_open():
+    cost = np.zeros((60, 80))
+    cost[40] = 0.01
+    assert calibrate(np.zeros((60, 80)), cost).value == 0.0

@@ -1,0 +1,5 @@
+"""`python -m trainer.sweep`."""
+
+from trainer.sweep import main
+
+main()
