@@ -223,6 +223,6 @@ def _report(folder: Path, jobs: Sequence[Job], console: Console) -> int:
     if done == len(jobs):
         console.print(f"see them with: lagnet-plot {shlex.quote(str(folder))}", **say)  # type: ignore[arg-type]
         return 0
-    command = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
+    command = shlex.join(["lagnet-sweep", *sys.argv[1:]])
     console.print(f"go on with the same command: {command}", **say)  # type: ignore[arg-type]
     return 130 if State.STOPPED in states else 1
