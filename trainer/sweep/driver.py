@@ -114,6 +114,7 @@ class Driver:
         self._jobs = jobs
         self._retries = settings.retries
         self._token = token
+        self._stopping = False
         self._ray = ray
         # A process of its own for each run (max_calls); what to do about a lost one is decided here.
         options = {"num_cpus": settings.threads, "max_retries": 0, "max_calls": 1}
@@ -162,17 +163,18 @@ class Driver:
         errors = self._ray.exceptions
         try:
             outcome: Outcome = self._ray.get(reference)
-        except (errors.TaskCancelledError, KeyboardInterrupt):
-            job.state = State.STOPPED
-        except errors.RayTaskError as error:
-            job.state, job.error = State.FAILED, str(error).strip()
         except errors.RayError as error:
-            self._lost(job, error)
+            if self._stopping:
+                job.state = State.STOPPED
+            elif isinstance(error, errors.RayTaskError):
+                job.state, job.error = State.FAILED, str(error).strip()
+            else:
+                self._lost(job, error)
         else:
             job.error = outcome.error
-            job.state = (
-                State.FINISHED if outcome.finished else State.FAILED if outcome.error else State.STOPPED
-            )
+            job.state = State.STOPPED if outcome.error is None else State.FAILED
+            if outcome.finished:
+                job.state = State.FINISHED
 
     def _lost(self, job: Job, error: Exception) -> None:
         """Its worker or the worker's node died: another one continues, unless that leads nowhere."""
@@ -185,7 +187,7 @@ class Driver:
 
     def _stop(self, board: Board) -> None:
         """Asks the workers to save and end; a second Ctrl-C no longer waits for them."""
-        self._retries = -1
+        self._stopping = True
         for reference in self._given:
             self._ray.cancel(reference)
         deadline = time.monotonic() + GRACE
@@ -194,8 +196,9 @@ class Driver:
                 self._step(board)
         except KeyboardInterrupt:
             pass
-        for job in self._given.values():
-            job.state = State.STOPPED
+        for job in self._jobs:
+            if job.active:
+                job.state = State.STOPPED
         self._given.clear()
 
 
@@ -208,6 +211,9 @@ def main() -> None:
     except TrainerError as error:
         console.print(f"[red]lagnet-sweep:[/red] {error}", highlight=False, soft_wrap=True)
         sys.exit(1)
+    except KeyboardInterrupt:
+        console.print("stopped before anything began")
+        sys.exit(130)
     sys.exit(_report(settings.out, jobs, console))
 
 
