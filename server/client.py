@@ -44,7 +44,7 @@ class Client:
 
     Raises:
         ClientError: if the service does not answer, or its observation layout is another.
-        ValueError: if the timeout is not finite and positive.
+        ValueError: if the timeout is not finite and positive, or the key is not printable ASCII.
     """
 
     def __init__(
@@ -65,6 +65,8 @@ class Client:
             raise ClientError(f"{url}: expected http://HOST:PORT")
         headers = {"content-type": "application/json"}
         if api_key is not None:
+            if not (api_key.isascii() and api_key.isprintable()):
+                raise ValueError("the API key must be printable ASCII")
             headers["authorization"] = f"Bearer {api_key}"
         self._timeout = timeout
         self._memory: MemoryJson | None = None
@@ -130,7 +132,7 @@ class Client:
 
     def _check(self, url: str, layout: Sequence[Mapping[str, Any]] | None) -> ModelReply:
         try:
-            status, content = self._link.exchange("GET", "/model", None, _CONNECT_TIMEOUT)
+            status, content = self._link.exchange("GET", "/model", b"", _CONNECT_TIMEOUT)
             if status != http.client.OK:
                 raise ClientError(
                     f"{url}: /model answered {status}: {content[:200].decode(errors='replace')}"

@@ -37,18 +37,18 @@ class Link:
     """
 
     def __init__(self, host: str, port: int, headers: dict[str, str]) -> None:
-        self._host = host
-        self._port = port
-        self._headers = headers
-        self._open: tuple[http.client.HTTPConnection, DeadlineSocket] | None = None
+        self._address = (host, port)
+        name = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+        self._headers = "".join(f"{key}: {value}\r\n" for key, value in {"host": name, **headers}.items())
+        self._socket: DeadlineSocket | None = None
 
-    def exchange(self, method: str, path: str, body: bytes | None, timeout: float) -> tuple[int, bytes]:
+    def exchange(self, method: str, path: str, body: bytes, timeout: float) -> tuple[int, bytes]:
         """One request and its reply.
 
         Args:
             method: "GET" or "POST"; it must be safe to send twice.
             path: the path.
-            body: what to send, or None.
+            body: what to send.
             timeout: how long connecting, sending and reading may take altogether [s].
 
         Returns:
@@ -60,7 +60,7 @@ class Link:
             http.client.HTTPException: if the reply is not HTTP.
         """
         deadline = time.monotonic() + timeout
-        kept = self._open is not None
+        kept = self._socket is not None
         try:
             return self._exchange(method, path, body, deadline)
         except ConnectionError:
@@ -71,17 +71,20 @@ class Link:
 
     def close(self) -> None:
         """Closes the connection."""
-        if self._open is not None:
-            self._open[0].close()
-            self._open = None
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
 
-    def _exchange(self, method: str, path: str, body: bytes | None, deadline: float) -> tuple[int, bytes]:
+    def _exchange(self, method: str, path: str, body: bytes, deadline: float) -> tuple[int, bytes]:
+        # Head and body leave in one packet; http.client would send two.
+        head = f"{method} {path} HTTP/1.1\r\n{self._headers}content-length: {len(body)}\r\n\r\n"
         try:
-            connection, opened = self._open or self._connect(deadline)
+            opened = self._socket or self._connect(deadline)
             opened.deadline = deadline
             opened.settimeout(remaining(deadline))
-            connection.request(method, path, body, self._headers)
-            response = connection.getresponse()
+            opened.sendall(head.encode("latin-1") + body)
+            response = http.client.HTTPResponse(opened, method=method)
+            response.begin()
             content = response.read()
         except (OSError, http.client.HTTPException):
             # Half an exchange may be left in it: the next reply would be the answer to this request.
@@ -91,10 +94,8 @@ class Link:
             self.close()
         return response.status, content
 
-    def _connect(self, deadline: float) -> tuple[http.client.HTTPConnection, DeadlineSocket]:
-        family, kind, protocol, _, address = socket.getaddrinfo(
-            self._host, self._port, type=socket.SOCK_STREAM
-        )[0]
+    def _connect(self, deadline: float) -> DeadlineSocket:
+        family, kind, protocol, _, address = socket.getaddrinfo(*self._address, type=socket.SOCK_STREAM)[0]
         opened = DeadlineSocket(family, kind, protocol)
         try:
             opened.settimeout(remaining(deadline))
@@ -103,10 +104,8 @@ class Link:
         except OSError:
             opened.close()
             raise
-        connection = http.client.HTTPConnection(self._host, self._port)
-        connection.sock = opened
-        self._open = (connection, opened)
-        return self._open
+        self._socket = opened
+        return opened
 
 
 def remaining(deadline: float) -> float:
