@@ -8,6 +8,8 @@ from typing import Literal
 
 from trainer.errors import ConfigError
 
+FILE = "config.json"
+
 AlgorithmName = Literal[
     "ppo", "ppo-lag", "trpo-lag", "cppo-pid", "ipo", "cpo", "scpo", "lagnet", "lagnet-foresight"
 ]

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from trainer.config import FILE as CONFIG
 from trainer.errors import CheckpointError
 from trainer.report import FILE
-from trainer.train import CONFIG
 
 Columns = dict[str, npt.NDArray[np.float64]]
 _NAME = re.compile(r"(?P<algorithm>.+)-d(?P<limit>[0-9.e+-]+)-s(?P<seed>[0-9]+)")

@@ -13,6 +13,8 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from trainer.errors import CheckpointError
 
 FILE = "progress.csv"
+TAIL = 500
+"""Episodes that a run's closing figures are averaged over."""
 Row = dict[str, float | int | None]
 
 

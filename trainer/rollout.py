@@ -11,12 +11,11 @@ from gymnasium.vector import VectorEnv
 
 from trainer.networks import HIDDEN, Shape
 from trainer.normaliser import Normaliser
+from trainer.report import TAIL
 
 Floats = npt.NDArray[np.float32]
 RECENT = 100
 """Episodes that J_c, the undiscounted episode cost, is averaged over (as in OmniSafe)."""
-TAIL = 500
-"""Episodes that a run's closing figures are averaged over."""
 
 
 @dataclass
@@ -197,7 +196,14 @@ class Rollout:
         }
 
     def load_state_dict(self, state: dict[str, npt.NDArray[Any]]) -> None:
-        """Takes on a state that state_dict returned."""
+        """Takes on a state that state_dict returned.
+
+        Raises:
+            ValueError: if it is of another number of environments or another task.
+        """
+        found = state["observation"].shape
+        if found != self._observation.shape:
+            raise ValueError(f"its observations have shape {found}, this run's {self._observation.shape}")
         env: Any = self.env
         env.load_state_dict({k.removeprefix("env."): v for k, v in state.items() if k.startswith("env.")})
         self._observation = state["observation"].copy()

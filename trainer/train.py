@@ -23,13 +23,13 @@ from rich.console import Console
 from trainer import checkpoint
 from trainer.algorithms import ALGORITHMS, prepare_environments
 from trainer.algorithms.base import Algorithm
+from trainer.config import FILE as CONFIG
 from trainer.config import Config, check
 from trainer.errors import CheckpointError, ConfigError, TrainerError
 from trainer.learner import Learner
 from trainer.report import Bar, Events, ProgressFile, Row
 from trainer.rollout import Rollout, mean
 
-CONFIG = "config.json"
 Environments = VectorEnv[Any, Any, Any]
 
 

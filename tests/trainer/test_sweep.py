@@ -14,7 +14,7 @@ from rich.console import Console
 
 from trainer import checkpoint
 from trainer.errors import CheckpointError, ConfigError, NonFiniteError
-from trainer.sweep import Sweep, driver, sweep, worker
+from trainer.sweep import Sweep, driver, sweep
 from trainer.sweep.job import Job, Progress, State, write_summary
 from trainer.sweep.settings import FOLDER, is_finished, plan, refuse_other_settings
 from trainer.sweep.table import Board, table
@@ -184,7 +184,7 @@ def test_a_worker_starts_a_run_or_continues_it(shared, monkeypatch):
     run = plan(small(shared))[0]
     given = []
     monkeypatch.setattr(
-        worker, "train", lambda config: given.append(config) or SimpleNamespace(finished=True)
+        "trainer.train.train", lambda config: given.append(config) or SimpleNamespace(finished=True)
     )
     run.folder.mkdir()
     (run.folder / "config.json.part").write_text("{")  # its first worker died here
@@ -200,7 +200,7 @@ def test_what_stops_a_run_comes_back_as_one_line(shared, monkeypatch):
     def diverge(config):
         raise NonFiniteError("critic_loss is nan")
 
-    monkeypatch.setattr(worker, "train", diverge)
+    monkeypatch.setattr("trainer.train.train", diverge)
     assert work(plan(small(shared))[0], "secret", 1, "node") == Outcome(False, "critic_loss is nan")
 
 

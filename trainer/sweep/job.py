@@ -13,7 +13,7 @@ import numpy as np
 from trainer import checkpoint
 from trainer.curves import Columns, closing, read_progress
 from trainer.errors import CheckpointError
-from trainer.rollout import TAIL
+from trainer.report import TAIL
 from trainer.sweep.settings import SweptRun
 from trainer.sweep.worker import read_holder
 

@@ -9,9 +9,9 @@ from typing import get_args
 from tyro.conf import Suppress
 
 from trainer import checkpoint
+from trainer.config import FILE as CONFIG
 from trainer.config import AlgorithmName, Config, check
 from trainer.errors import ConfigError
-from trainer.train import CONFIG, load_config
 
 FOLDER = ".sweep"
 """Folder beside the runs, for what the sweep itself keeps there."""
@@ -108,6 +108,8 @@ def refuse_other_settings(run: SweptRun) -> None:
     """
     if not (run.folder / CONFIG).exists():
         return
+    from trainer.train import load_config  # with torch, which a sweep that begins does without
+
     there = load_config(run.folder)
     for each in dataclasses.fields(Config):
         old, new = getattr(there, each.name), getattr(run.config, each.name)

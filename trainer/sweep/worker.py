@@ -11,10 +11,10 @@ from pathlib import Path
 from time import monotonic, sleep
 from typing import TextIO
 
+from trainer.config import FILE as CONFIG
 from trainer.config import Config
 from trainer.errors import CheckpointError, ConfigError, TrainerError
 from trainer.sweep.settings import FOLDER, SweptRun
-from trainer.train import CONFIG, train
 
 TOKEN = "token"
 """File that tells a node whether it sees the sweep's folder or one of its own at the same path."""
@@ -49,6 +49,8 @@ def work(run: SweptRun, token: str, attempt: int, node: str) -> Outcome:
     Returns:
         How it ended.
     """
+    from trainer.train import train  # with torch, which the process that only hands out runs does without
+
     try:
         _check_storage(run.folder.parent, token)
         with claim(run.claim, {"node": node, "pid": os.getpid(), "attempt": attempt}, PATIENCE):
