@@ -202,6 +202,7 @@ def _draw_over_time(rows: list[Axes], drives: Mapping[str, Drive], threshold: fl
         risk.plot(seconds, one.risk, color=colour, lw=wide, label=name)
         barrier.plot(seconds, one.barrier, color=colour, lw=wide)
         cost.plot(seconds, np.cumsum(one.cost), color=colour, lw=wide)
+    risk.set_ylim(bottom=0.0)
     risk.axhline(threshold, color=_INK, lw=0.9, ls=(0, (4, 3)))
     across = risk.get_yaxis_transform()
     risk.text(0.998, threshold, "threshold", va="bottom", ha="right", fontsize=8, transform=across)
