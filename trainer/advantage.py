@@ -7,7 +7,7 @@ Floats = npt.NDArray[np.float32]
 
 
 def successor_values(
-    values: Floats, ended: npt.NDArray[np.bool_], terminated: npt.NDArray[np.bool_], final_values: Floats
+    values: Floats, ended: npt.NDArray[np.bool_], over: npt.NDArray[np.bool_], final_values: Floats
 ) -> Floats:
     """Value of the state that each step led to, before any reset.
 
@@ -17,7 +17,7 @@ def successor_values(
     Args:
         values: V(s_t) [T + 1, N].
         ended: whether an episode ended with the step [T, N].
-        terminated: whether it ended in a terminal state [T, N].
+        over: whether nothing more can come after it, a terminal state [T, N].
         final_values: V(final observation), one for each True of `ended` in row-major order [E].
 
     Returns:
@@ -25,7 +25,7 @@ def successor_values(
     """
     successors = values[1:].copy()
     successors[ended] = final_values
-    successors[terminated] = 0.0
+    successors[over] = 0.0
     return successors
 
 

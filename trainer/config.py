@@ -71,8 +71,8 @@ class Config:
     """Initial log standard deviation of the policy's actions."""
 
     rescale: Literal["mean", "state"] | None = None
-    """lagnet, lagnet-foresight: divide eq. 14 by 1 + mean λ, or each state's term by 1 + λ_ξ(s). None takes
-    "mean" for lagnet and "state" for lagnet-foresight."""
+    """lagnet, lagnet-foresight: divide eq. 14 by 1 + mean λ, or each state's term by 1 + λ_ξ(s) σ_c. Not set:
+    "mean" for lagnet, "state" for lagnet-foresight."""
     multiplier_init: float = 20.0
     """lagnet: the value λ_ξ(s) starts at in every state (the paper's is about 20)."""
     multiplier_learning_rate: float = 3e-4

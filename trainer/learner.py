@@ -108,12 +108,14 @@ class Learner:
         """Reward and cost values [2, B] of normalised observations [B, n]."""
         return torch.stack([fast_mlp(row, observation, self.critic_shape)[:, 0] for row in self.critics])
 
-    def batch(self, trajectory: Trajectory, cost_discount: float) -> Batch:
+    def batch(self, trajectory: Trajectory, cost_discount: float, cost_outlives_episode: bool) -> Batch:
         """Turns a trajectory into samples with advantages and targets.
 
         Args:
             trajectory: one epoch.
             cost_discount: γ of the cost.
+            cost_outlives_episode: whether a time limit leaves the cost's value at the final observation; the
+                reward's it always does.
 
         Returns:
             The batch.
@@ -133,12 +135,13 @@ class Learner:
         order = self.rng.permutation(T * N)
         rows = torch.from_numpy(order)
         advantages, targets = [], []
-        for k, signal, discount in (
-            (REWARD, trajectory.reward, config.discount),
-            (COST, trajectory.cost, cost_discount),
+        ended, terminated = trajectory.ended, trajectory.terminated
+        for k, signal, discount, over in (
+            (REWARD, trajectory.reward, config.discount, terminated),
+            (COST, trajectory.cost, cost_discount, terminated if cost_outlives_episode else ended),
         ):
-            after = successor_values(values[k], trajectory.ended, trajectory.terminated, final_values[k])
-            advantage = gae(signal, values[k], after, trajectory.ended, discount, config.gae)
+            after = successor_values(values[k], ended, over, final_values[k])
+            advantage = gae(signal, values[k], after, ended, discount, config.gae)
             advantages.append(torch.from_numpy(advantage.reshape(-1)[order]))
             targets.append(torch.from_numpy((advantage + values[k][:-1]).reshape(-1)[order]))
         reward_advantage, cost_advantage = advantages

@@ -25,7 +25,7 @@ from trainer.algorithms import ALGORITHMS, prepare_environments
 from trainer.algorithms.base import Algorithm
 from trainer.config import FILE as CONFIG
 from trainer.config import Config, check
-from trainer.errors import CheckpointError, ConfigError, TrainerError
+from trainer.errors import CheckpointError, ConfigError, NonFiniteError, TrainerError
 from trainer.learner import Learner
 from trainer.report import Bar, Events, ProgressFile, Row
 from trainer.rollout import Rollout, mean
@@ -90,6 +90,7 @@ class Run:
         self.algorithm: Algorithm = ALGORITHMS[config.algorithm](self.learner)
         self.rollout = Rollout(env, config.horizon, config.episode_steps, config.seed, self.rng)
         self.epoch = 0
+        self.saved = 0
 
     @property
     def steps(self) -> int:
@@ -107,8 +108,7 @@ class Run:
         actor = learner.actor.detach().numpy()
         trajectory = rollout.collect(actor, learner.actor_shape, learner.normaliser)
         figures = rollout.figures
-        batch = learner.batch(trajectory, self.algorithm.cost_discount)
-        logged = self.algorithm.update(batch, figures)
+        logged = self.algorithm.update(self.algorithm.batch(trajectory), figures)
         seen = trajectory.observation[:-1]
         learner.normaliser.update(seen.reshape(-1, seen.shape[-1]))
         self.epoch += 1
@@ -145,6 +145,7 @@ class Run:
             "action_high": self.bounds.high.tolist(),
         }
         checkpoint.write(self.folder, arrays, facts)
+        self.saved = self.epoch
 
     def load(self) -> int:
         """Takes on the folder's checkpoint; returns the length of progress.csv that belongs to it [bytes].
@@ -209,6 +210,7 @@ def train(
         figures={
             "training_return": mean(list(figures.returns)),
             "training_cost": mean(list(figures.costs)),
+            "training_constrained": mean(list(figures.constrained)),
             "training_episodes": float(len(figures.costs)),
         },
         seconds=spent,
@@ -225,7 +227,11 @@ def _loop(
     with _stop_request() as stopping, Bar(config.total_steps, run.steps, console) as bar:
         while run.epoch < config.epochs and not stopping():
             clock = perf_counter()
-            row = run.advance()
+            try:
+                row = run.advance()
+            except NonFiniteError as error:
+                kept = f"the checkpoint at {run.saved * config.epoch_steps:,} steps is kept in {run.folder}"
+                raise NonFiniteError(f"{error} in epoch {run.epoch + 1}; {kept}") from error
             table.add(row)
             if run.epoch % config.checkpoint_every == 0:
                 table.sync()

@@ -10,10 +10,11 @@ STEPS = 20
 
 
 class TinyTask(gymnasium.vector.VectorEnv):
-    """Observation x, uniform in [-1, 1] and drawn anew each step; reward a; cost max(0, a) where x > 0.
+    """Observation x, uniform in [-1, 1] and drawn anew each step; reward 2a − a²; cost max(0, a) where x > 0.
 
-    20 steps an episode. With a cost limit d the best return is 10 + d: a = 1 wherever x ≤ 0 (half of the
-    steps), and where x > 0 as much as the limit allows, since reward and cost grow together there.
+    20 steps an episode. Without a limit, a = 1 everywhere is best: return 20, cost 10. With a cost limit d,
+    a = 1 wherever x ≤ 0 (half of the steps) and, the reward being concave, a = d / 10 wherever x > 0:
+    return 10 + 2d − d² / 10.
     The observation's second number is the share of the episode that is over.
     """
 
@@ -22,7 +23,7 @@ class TinyTask(gymnasium.vector.VectorEnv):
     def __init__(self, num_envs: int = 10, poison_after: int | None = None) -> None:
         self.num_envs = num_envs
         self.single_observation_space = gymnasium.spaces.Box(-1, 1, (2,), np.float64)
-        self.single_action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float64)
+        self.single_action_space = gymnasium.spaces.Box(-3, 3, (1,), np.float64)
         self.poison_after = poison_after
         self.taken = 0
 
@@ -48,7 +49,7 @@ class TinyTask(gymnasium.vector.VectorEnv):
         if truncated.any():
             info |= {"final_obs": self._observe(), "_final_obs": truncated}
             self.elapsed = np.where(truncated, 0, self.elapsed)
-        return self._observe(), a, np.zeros(self.num_envs, bool), truncated, info
+        return self._observe(), 2 * a - a**2, np.zeros(self.num_envs, bool), truncated, info
 
     def state_dict(self) -> dict[str, np.ndarray]:
         state = self.rng.bit_generator.state["state"]

@@ -45,7 +45,7 @@ def make(algorithm, **settings):
     )  # fmt: skip
     figures = Figures(step_cost=float(trajectory.cost.mean()))
     figures.constrained.extend([3.0, 5.0])
-    return rule, learner, learner.batch(trajectory, rule.cost_discount), figures
+    return rule, learner, rule.batch(trajectory), figures
 
 
 def module(theta, outputs):
@@ -291,7 +291,7 @@ def test_a_loss_that_is_not_finite_is_named(algorithm, broken, term):
 
 
 def test_an_environment_that_is_not_finite_is_named():
-    _, learner, batch, _ = make("ppo")
+    rule, _, batch, _ = make("ppo")
     batch.trajectory.reward[2, 1] = np.inf
     with pytest.raises(NonFiniteError, match="reward"):
-        learner.batch(batch.trajectory, 0.99)
+        rule.batch(batch.trajectory)

@@ -3,7 +3,7 @@
 from trainer.algorithms.multiplier import MultiplierNetwork
 from trainer.dual import Numbers
 from trainer.learner import Batch, Learner
-from trainer.rollout import Figures
+from trainer.rollout import Figures, Trajectory
 
 
 class Algorithm:
@@ -13,10 +13,9 @@ class Algorithm:
         self.learner = learner
         self.config = learner.config
 
-    @property
-    def cost_discount(self) -> float:
-        """γ of the cost."""
-        return self.config.discount
+    def batch(self, trajectory: Trajectory) -> Batch:
+        """The epoch's samples, with the reward's and the cost's advantages both discounted by γ."""
+        return self.learner.batch(trajectory, self.config.discount, cost_outlives_episode=True)
 
     def update(self, batch: Batch, figures: Figures) -> dict[str, float]:
         """One update on one epoch.

@@ -24,14 +24,18 @@ def statewise_update(
         batch: the epoch.
         multiplier: λ_ξ(s) [B].
         rescale: "mean" divides eq. 14 as a whole by 1 + mean λ (Adam does not see a common factor, the
-            gradient clip does); "state" divides each state's term by its own 1 + λ_ξ(s), which keeps the best
-            action of every state, and keeps the few states of large λ from deciding the whole step.
+            gradient clip does); "state" divides each state's term by its own 1 + λ_ξ(s) σ_c, with σ_c the
+            deviation of A_c (that of A is 1): this keeps the best action of every state, and keeps the few
+            states of large λ from deciding the whole step.
 
     Returns:
         Figures to log.
     """
     clip = learner.config.clip
-    weight = 1 / (1 + (multiplier if rescale == "state" else multiplier.mean().expand_as(multiplier)))
+    if rescale == "state":
+        weight = 1 / (1 + multiplier * batch.cost_advantage.std())
+    else:
+        weight = 1 / (1 + multiplier.mean().expand_as(multiplier))
     advantage = weight * batch.reward_advantage
     penalty = weight * multiplier
 

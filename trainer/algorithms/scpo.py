@@ -11,7 +11,7 @@ from trainer.algorithms.base import Algorithm
 from trainer.algorithms.cpo import cpo_update
 from trainer.critics import fit_critics
 from trainer.learner import Batch
-from trainer.rollout import Figures
+from trainer.rollout import Figures, Trajectory
 
 
 class MaximumCost(VectorWrapper):
@@ -69,10 +69,9 @@ class MaximumCost(VectorWrapper):
 class SCPO(Algorithm):
     """CPO's step with E[largest cost of an episode] ≤ w as its constraint, undiscounted."""
 
-    @property
-    def cost_discount(self) -> float:
-        """1: an episode's increments add up to its largest cost."""
-        return 1.0
+    def batch(self, trajectory: Trajectory) -> Batch:
+        """The cost undiscounted and over at the episode's end: the increments add up to its largest cost."""
+        return self.learner.batch(trajectory, 1.0, cost_outlives_episode=False)
 
     def update(self, batch: Batch, figures: Figures) -> dict[str, float]:
         """One update on one epoch, see Algorithm.update."""

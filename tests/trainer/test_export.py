@@ -1,0 +1,97 @@
+import json
+from dataclasses import replace
+
+import numpy as np
+import onnxruntime
+import pytest
+import torch
+
+from models import Bundle
+from trainer import export
+from trainer.config import Config
+from trainer.errors import CheckpointError, ExportError
+from trainer.export import ExportConfig, TrainedRun
+from trainer.train import train
+
+SETTINGS = {
+    "total_steps": 400, "num_envs": 4, "epoch_steps": 200, "minibatch": 100, "passes": 1, "threads": 1,
+    "tensorboard": False,
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs") / "run"
+    train(Config(algorithm="lagnet-foresight", out=folder, **SETTINGS))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def bundle(run):
+    target = run.parent / "bundle"
+    export.export(ExportConfig(run, target, episodes=3, threads=1))
+    return Bundle.load(target)
+
+
+def test_the_bundle_says_what_it_is(bundle):
+    manifest = bundle.manifest
+    assert (manifest.task, manifest.level, manifest.algorithm) == ("PointGoal1-v0", 1, "lagnet-foresight")
+    assert manifest.training["total_steps"] == 400
+    assert manifest.figures["episodes"] == 3
+    assert {"return", "cost", "steps", "onnx_difference_action"} <= manifest.figures.keys()
+    assert manifest.threshold == 0
+    assert manifest.threshold_source.startswith("gate always open")
+    json.dumps(manifest.training)
+
+
+def test_the_graphs_compute_what_torch_computes(run, bundle):
+    trained = TrainedRun(run)
+    rng = np.random.default_rng(0)
+    observation = rng.normal(0, 3, (50, 60)).astype(np.float32)
+    for data, name, expected in (
+        (bundle.policy, "action", trained.actions(observation)),
+        (bundle.multiplier, "multiplier", trained.multipliers(observation)),
+    ):
+        session = onnxruntime.InferenceSession(data)
+        (whole,) = session.run([name], {"observation": observation})
+        (one,) = session.run([name], {"observation": observation[:1]})
+        np.testing.assert_allclose(whole, expected, atol=1e-5)
+        np.testing.assert_allclose(one, whole[:1], atol=1e-6)
+    assert (np.abs(trained.actions(observation)) <= 1).all()
+    assert (trained.multipliers(observation) >= 0).all()
+
+
+def test_graphs_that_differ_are_refused(run, tmp_path, monkeypatch):
+    honest = TrainedRun.graphs
+
+    def shifted(self):
+        graphs = honest(self)
+        with torch.no_grad():
+            self.learner.actor[:100] += 0.01
+        return graphs
+
+    monkeypatch.setattr(TrainedRun, "graphs", shifted)
+    with pytest.raises(ExportError, match=r"differ by .* in the action"):
+        export.export(ExportConfig(run, tmp_path / "bundle", episodes=2, threads=1))
+    assert not (tmp_path / "bundle").exists()
+
+
+def test_an_algorithm_without_multiplier_network_leaves_the_gate_open(tmp_path):
+    train(Config(algorithm="ppo", out=tmp_path / "run", **SETTINGS))
+    manifest = export.export(ExportConfig(tmp_path / "run", tmp_path / "bundle", episodes=2, threads=1))
+    assert manifest.threshold < export.NO_NETWORK
+    assert "no multiplier network" in manifest.threshold_source
+
+
+def test_what_cannot_be_a_bundle_is_refused(tmp_path, tiny_task):
+    config = Config(algorithm="scpo", out=tmp_path / "scpo", **SETTINGS)
+    train(config)
+    with pytest.raises(ExportError, match="cannot be exported"):
+        export.export(ExportConfig(tmp_path / "scpo", tmp_path / "bundle"))
+    train(
+        replace(config, algorithm="ppo", out=tmp_path / "tiny", task="Tiny"), lambda c: tiny_task(c.num_envs)
+    )
+    with pytest.raises(ExportError, match="not Tiny"):
+        export.export(ExportConfig(tmp_path / "tiny", tmp_path / "bundle"))
+    with pytest.raises(CheckpointError, match="no run"):
+        export.export(ExportConfig(tmp_path / "nowhere", tmp_path / "bundle"))
