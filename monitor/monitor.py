@@ -242,7 +242,7 @@ class Monitor:
         onnxruntime's tanh, for one, reaches 1.0000001.
         """
         clipped = np.minimum(np.maximum(action, self._low), self._high)
-        sound = (np.abs(action - clipped) <= _ROUNDING).all(axis=1)
+        sound: NDArray[np.bool_] = np.all(np.abs(action - clipped) <= _ROUNDING, axis=1)
         return np.where(sound[:, None], clipped, action), sound
 
     def _check_observation(self, observation: FloatArray) -> None:
