@@ -376,11 +376,13 @@ def save(figure: Figure, path: Path, dpi: int = 200) -> None:
     """Writes the picture.
 
     Raises:
-        ConfigError: if the ending is none of .png, .pdf, .svg.
+        ConfigError: if the ending is none of .png, .pdf, .svg, or the resolution is not above 0.
         CheckpointError: if the file cannot be written.
     """
     if path.suffix.lower() not in SUFFIXES:
         raise ConfigError(f"--out {path} must end in one of {', '.join(SUFFIXES)}")
+    if dpi < 1:
+        raise ConfigError(f"--dpi must be above 0, not {dpi}")
     try:
         with rc_context(_FONT):
             figure.savefig(path, dpi=dpi)

@@ -218,6 +218,7 @@ def test_the_command_draws_one_run_in_colours_that_tell_the_bands(tmp_path, monk
     [
         (("{run}", "--out", "picture.jpg"), "must end in one of"),
         (("{run}", "--out", "{root}/missing/picture.png"), "cannot write"),
+        (("{run}", "--dpi", "0"), "--dpi must be above 0"),
         (("{root}/empty",), "has reported anything yet"),
         (("{root}/nowhere",), "is no folder"),
     ],

@@ -332,6 +332,22 @@ def test_without_ray_the_sweep_says_how_to_get_it(tmp_path, monkeypatch):
         sweep(small(tmp_path), QUIET)
 
 
+@pytest.mark.parametrize(
+    ("address", "said"),
+    [
+        ("ray://127.0.0.1:1", "no Ray cluster answers at ray://127.0.0.1:1"),
+        ("127.0.0.1:1", "no Ray cluster answers"),
+        ("127.0.0.1:99999999", "no Ray cluster answers"),
+        ("ray://head", "must be ray://HOST:PORT"),
+        ("head:", "must be ray://HOST:PORT"),
+    ],
+)
+def test_an_address_without_a_cluster_is_told_at_once(tmp_path, address, said):
+    pytest.importorskip("ray")
+    with pytest.raises(ConfigError, match=said):
+        sweep(small(tmp_path, address=address), QUIET)
+
+
 def test_two_sweeps_do_not_share_a_folder(tmp_path):
     (tmp_path / FOLDER).mkdir()
     with claim(tmp_path / FOLDER / "driver", {"pid": 1}, 0.0), pytest.raises(CheckpointError, match="in use"):

@@ -26,7 +26,7 @@ TINY = {
     "passes": 1, "checkpoint_every": 2,
 }  # fmt: skip
 ENVIRONMENT = os.environ | {"RAY_USAGE_STATS_ENABLED": "0", "OMP_NUM_THREADS": "1"}
-SECONDS = 90.0
+SECONDS = 120.0
 
 
 def command(out: Path, *more: str) -> list[str]:

@@ -26,6 +26,8 @@ PERIOD = 1.0
 """Between two looks at the runs [s]."""
 GRACE = 60.0
 """How long stopped runs have to complete their epoch and write their checkpoint [s]."""
+_ANSWER = 10.0
+"""How long a cluster has to accept a connection [s]."""
 _STORE = 80_000_000
 """Size of Ray's object store on this machine [bytes]: next to nothing passes through it."""
 
@@ -82,6 +84,8 @@ def _ray(settings: Sweep) -> Iterator[Any]:
         import ray
     except ImportError as error:
         raise ConfigError("lagnet-sweep needs Ray: pip install 'lagnet[sweep]'") from error
+    if settings.address is not None:
+        _check_address(settings.address)
     # Before a worker imports numpy: BLAS reads the number of its threads once.
     threads = {f"{library}_NUM_THREADS": str(settings.threads) for library in ("OMP", "OPENBLAS", "MKL")}
     options: dict[str, Any] = {"runtime_env": {"env_vars": threads}, "log_to_driver": False}
@@ -97,6 +101,21 @@ def _ray(settings: Sweep) -> Iterator[Any]:
         yield ray
     finally:
         ray.shutdown()
+
+
+def _check_address(address: str) -> None:
+    """Makes sure that something listens there: Ray itself would try for minutes.
+
+    Raises:
+        ConfigError: if the address is none, or nothing answers.
+    """
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if not host or not port.isdecimal():
+        raise ConfigError(f"--address must be ray://HOST:PORT or HOST:PORT, not {address}")
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), timeout=_ANSWER).close()
+    except (OSError, OverflowError) as error:
+        raise ConfigError(f"no Ray cluster answers at {address}: {error}") from error
 
 
 def _work_here(run: SweptRun, token: str, attempt: int) -> Outcome:
