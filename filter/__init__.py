@@ -1,16 +1,9 @@
 """The safety filter: the robot's dynamics, obstacles, barrier, QP, certificate and backup manoeuvres."""
 
-from filter.barrier_filter import (
-    SAFE_ACTION,
-    BarrierFilter,
-    FilterMemory,
-    FilterResult,
-    Mode,
-    Row,
-    committed_backup,
-)
+from filter.barrier_filter import BarrierFilter, committed_backup
 from filter.config import FilterConfig
 from filter.errors import FilterError, FilterInputError, SolverError
+from filter.result import SAFE_ACTION, FilterMemory, FilterResult, Mode, Row
 
 __all__ = [
     "SAFE_ACTION",

@@ -1,8 +1,8 @@
 """The backup manoeuvres, and how far each of them stays from every obstacle.
 
-A backup is a feedback law of the reduced model, so what is left of a manoeuvre after one step is the same law's
-manoeuvre from the new state: a certificate carries over from step to step. Each runs for any number of control
-steps and then coasts; to coast at once is the shortest of all of them.
+A backup is a feedback law of the reduced model, so what is left of a manoeuvre after one step is the same
+law's manoeuvre from the new state: a certificate carries over from step to step. Each runs for any number of
+control steps and then coasts; to coast at once is the shortest of all of them.
 
 - ``FORWARD`` and ``REVERSE``: full thrust along or against the heading, which is held. The one against the
   motion brakes; the one along it takes the stop point past or away from an obstacle.
@@ -26,8 +26,8 @@ FloatArray = NDArray[np.float64]
 FORWARD, REVERSE, TURN = 0, 1, 2
 BACKUPS = 3
 """How many backup manoeuvres there are."""
-STEPS = 25
-"""Control steps for which a backup thrusts at most: 0.5 s; a full brake from top speed takes 0.36 s."""
+STEPS = 20
+"""Control steps for which a backup thrusts at most: 0.4 s; a full brake from top speed takes 0.36 s."""
 
 
 @compiled
@@ -83,7 +83,8 @@ def clearance(
         first: the obstacle to look at first; -1 for any.
 
     Returns:
-        The clearance [m], after ``travel_error``; the obstacle that bounds it, -1 if none; the steps of thrust.
+        The clearance [m], after ``travel_error``; the obstacle that bounds it, -1 if none; the steps of
+        thrust.
     """
     seconds = settings.robot.physics_step * settings.robot.substeps
     at = start
@@ -107,7 +108,7 @@ def clearance(
             break
         thrust, turn = law(settings, kind, at)
         after = follow(settings.robot, at, thrust, turn, seconds)
-        distance, nearest = least_gap(obstacles, count, at.x, at.y, after.x, after.y, first, -FAR)
+        distance, nearest = least_gap(obstacles, count, at.x, at.y, after.x, after.y, first, best)
         if distance < path:
             path = distance
             on_path = nearest
@@ -128,22 +129,22 @@ def clearances(
     start: Stopping,
     out: FloatArray,
 ) -> None:
-    """The clearance [m] from each obstacle of a backup that thrusts for a given number of steps, into ``out``."""
+    """Write the clearance [m] of a backup with a given number of steps of thrust from each obstacle."""
     seconds = settings.robot.physics_step * settings.robot.substeps
     at = start
     travelled = 0.0
     for i in range(count):
-        out[i] = gap(obstacles[i], at.x, at.y)
+        out[i] = gap(obstacles, i, at.x, at.y)
     for _ in range(steps):
         thrust, turn = law(settings, kind, at)
         after = follow(settings.robot, at, thrust, turn, seconds)
         for i in range(count):
-            out[i] = min(out[i], gap_segment(obstacles[i], at.x, at.y, after.x, after.y))
+            out[i] = min(out[i], gap_segment(obstacles, i, at.x, at.y, after.x, after.y, out[i]))
         travelled += math.hypot(after.x - at.x, after.y - at.y)
         at = after
     rest = settings.travel_error * (travelled + math.hypot(at.zx - at.x, at.zy - at.y))
     for i in range(count):
-        out[i] = min(out[i], gap_segment(obstacles[i], at.x, at.y, at.zx, at.zy)) - rest
+        out[i] = min(out[i], gap_segment(obstacles, i, at.x, at.y, at.zx, at.zy, out[i])) - rest
 
 
 @compiled

@@ -1,4 +1,4 @@
-"""The certificate of one action: one exact step of the model, the path within it, and a backup from where it ends."""
+"""The certificate of an action: an exact step of the model, the path within it, and a backup from its end."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ def certify(
         enough: stop looking at a clearance of this much [m]; 0 asks only whether the action is certified.
 
     Returns:
-        The clearance [m], at or above 0 if the action is certified; the obstacle that bounds it; the backup; its
-        steps of thrust.
+        The clearance [m], at or above 0 if the action is certified; the obstacle that bounds it; the backup;
+        its steps of thrust.
     """
     half = settings.robot.substeps // 2
     middle = advance(settings.robot, state, thrust, turn, half)

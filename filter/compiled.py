@@ -1,4 +1,4 @@
-"""Compilation of the scalar loops with numba, so that one decision costs microseconds and N cost N times that."""
+"""Compilation of the scalar loops with numba: one decision costs microseconds, and N cost N times that."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def compiled(function: Function) -> Function:
-    """Compile a helper that only other compiled functions call; it becomes part of each caller's machine code."""
+    """Compile a helper that only compiled functions call; it becomes part of their machine code."""
     return cast(Function, numba.njit(error_model="numpy")(function))
 
 

@@ -1,9 +1,10 @@
-"""The way round: the shortest path past the hazards to the goal, and the action that takes the robot along it.
+"""The way round: the shortest path past the hazards to the goal, and the action that follows it.
 
-A policy that keeps pushing at a hazard would stand in front of it for ever: no certificate can change that. So while
-a hazard stands in the straight way to the goal, the filter's reference is not the nominal action but the one that
-drives along the shortest path round it. Hazards are discs, so the path runs along their tangents; it is found by a
-best-first search over tangent lines (a tangent visibility graph, expanded only where it is needed).
+A policy that keeps pushing at a hazard would stand in front of it for ever: no certificate can change that.
+So while a hazard stands in the straight way to the goal, the filter's reference is not the nominal action
+but the one that drives along the shortest path round it. Hazards are discs, so the path runs along their
+tangents; it is found by a best-first search over tangent lines (a tangent visibility graph, expanded only
+where it is needed).
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 
 from filter.compiled import compiled
 from filter.config import Settings
-from filter.robot import State, stopping
+from filter.robot import State, advance, stopping
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -25,6 +26,12 @@ _NODES = 64
 """Most points that a search looks at."""
 _HOP = math.tan(math.radians(20.0))
 """The path goes past each tangent point by this share of the radius: round a disc in hops of 40 degrees."""
+_TURN_MOTION = 0.5
+"""Length that it costs to give up a metre of the way to the stop point."""
+_TURN_HEADING = 0.1
+"""Length that it costs to turn by a radian [m]."""
+_ALONG = 0.7
+"""Least cosine of the angle to the way round of a thrust that counts as driving round."""
 _TRIES = 5
 """Most discs that one hop is moved aside for."""
 
@@ -36,8 +43,7 @@ class Path(NamedTuple):
         x, y: its end [m].
         blocker: the disc in the straight way, -1 if there is none.
         distance: how far off that is [m].
-        side: 1 if the first disc is passed with the robot to the left of it, else -1; 0 without one.
-        length: of the whole path, an estimate [m].
+        side: 1 if the robot passes to the left of the first disc, else -1; 0 without one.
     """
 
     x: float
@@ -45,7 +51,6 @@ class Path(NamedTuple):
     blocker: int
     distance: float
     side: int
-    length: float
 
 
 @compiled
@@ -86,12 +91,12 @@ def first_hit(
 
 
 @compiled
-def tangent(disc: FloatArray, x: float, y: float, side: int) -> tuple[float, float]:
+def tangent(discs: FloatArray, i: int, x: float, y: float, side: int) -> tuple[float, float]:
     """The point to drive to from (x, y) to pass a disc on a side: a little past the tangent point."""
-    cx = disc[0] - x
-    cy = disc[1] - y
+    cx = discs[i, 0] - x
+    cy = discs[i, 1] - y
     distance = math.sqrt(cx * cx + cy * cy)
-    radius = min(disc[2], 0.99 * distance)
+    radius = min(discs[i, 2], 0.99 * distance)
     way = math.sqrt(distance * distance - radius * radius)
     sine = side * radius / distance
     cosine = way / distance
@@ -104,81 +109,95 @@ def tangent(disc: FloatArray, x: float, y: float, side: int) -> tuple[float, flo
 @compiled
 def _hop(
     discs: FloatArray, count: int, x: float, y: float, blocker: int, side: int
-) -> tuple[bool, float, float, int]:
-    """A free way from (x, y) past a disc on a side: whether there is one, its end, and the disc it passes."""
+) -> tuple[bool, float, float]:
+    """A free way from (x, y) past a disc, or those beside it, on a side: whether there is one; its end."""
     disc = blocker
     for _ in range(_TRIES):
-        tx, ty = tangent(discs[disc], x, y, side)
+        tx, ty = tangent(discs, disc, x, y, side)
         other, _ = first_hit(discs, count, x, y, tx, ty, disc)
         if other < 0:
-            return True, tx, ty, disc
+            return True, tx, ty
         disc = other
-    return False, x, y, disc
+    return False, x, y
+
+
+@compiled
+def _cheapest(nodes: FloatArray, size: int) -> int:
+    """The open node with the least estimate, -1 if none is open."""
+    best = -1
+    for i in range(size):
+        if nodes[i, 5] < math.inf and (best < 0 or nodes[i, 5] < nodes[best, 5]):
+            best = i
+    return best
+
+
+@compiled
+def _change(x: float, y: float, zx: float, zy: float, way: int, side: int, steadiness: float) -> float:
+    """What a first leg to (x, y) costs beyond its length [m]: turning motion, heading, and mind."""
+    leg = math.hypot(x, y)
+    cost = _TURN_MOTION * (math.hypot(zx, zy) - (zx * x + zy * y) / leg)
+    cost += _TURN_HEADING * abs(math.atan2(y, x))
+    if side == -way:
+        cost += steadiness
+    return cost
 
 
 @compiled
 def shortest_path(
-    discs: FloatArray, count: int, goal_x: float, goal_y: float, vx: float, vy: float, side: int, mind: float
+    discs: FloatArray,
+    count: int,
+    goal: tuple[float, float],
+    stop: tuple[float, float],
+    side: int,
+    steadiness: float,
 ) -> Path:
     """Search for the shortest path from the origin to the goal.
 
     Args:
         discs: (M, 3) centres and radii [m].
         count: how many of them there are.
-        goal_x: of the goal [m].
-        goal_y: of the goal [m].
-        vx: where the motion carries the robot, from the origin [m]: the side that it favours costs less.
-        vy: likewise.
+        goal: its centre [m].
+        stop: the robot's stop point [m]; the side that its motion favours costs less.
         side: the side chosen before, or 0.
+        steadiness: what the other side costs more [m].
 
     Returns:
         The path's first leg; the straight way if nothing blocks it or if no way round was found.
     """
-    blocker, distance = first_hit(discs, count, 0.0, 0.0, goal_x, goal_y, -1)
-    straight = math.hypot(goal_x, goal_y)
+    gx, gy = goal
+    blocker, distance = first_hit(discs, count, 0.0, 0.0, gx, gy, -1)
+    straight = math.hypot(gx, gy)
     if blocker < 0:
-        return Path(goal_x, goal_y, -1, straight, 0, straight)
+        return Path(gx, gy, -1, straight, 0)
     # One row a node: x, y, length of the path so far, first leg's end x, y, estimate of the whole.
-    nodes = np.empty((_NODES, 6))
-    first_side = np.zeros(_NODES, dtype=np.int64)
-    nodes[0] = (0.0, 0.0, 0.0, 0.0, 0.0, straight)
+    nodes = np.zeros((_NODES, 6))
+    sides = np.zeros(_NODES, dtype=np.int64)
+    nodes[0, 5] = straight
     size = 1
     while True:
-        best = -1
-        for i in range(size):
-            if nodes[i, 5] < 1e9 and (best < 0 or nodes[i, 5] < nodes[best, 5]):
-                best = i
+        best = _cheapest(nodes, size)
         if best < 0:
-            return Path(goal_x, goal_y, blocker, distance, 0, straight)
-        x, y, length = nodes[best, 0], nodes[best, 1], nodes[best, 2]
-        estimate = nodes[best, 5]
+            return Path(gx, gy, blocker, distance, 0)
+        x, y = nodes[best, 0], nodes[best, 1]
         nodes[best, 5] = math.inf
-        hit, _ = first_hit(discs, count, x, y, goal_x, goal_y, -1)
+        hit, _ = first_hit(discs, count, x, y, gx, gy, -1)
         if hit < 0 or size + 2 > _NODES:
-            return Path(nodes[best, 3], nodes[best, 4], blocker, distance, first_side[best], estimate)
-        for turn in range(2):
-            way = 1 - 2 * turn
-            free, tx, ty, _ = _hop(discs, count, x, y, hit, way)
+            return Path(nodes[best, 3], nodes[best, 4], blocker, distance, sides[best])
+        for way in (1, -1):
+            free, tx, ty = _hop(discs, count, x, y, hit, way)
             if not free:
                 continue
-            leg = math.hypot(tx - x, ty - y)
+            nodes[size] = nodes[best]
             nodes[size, 0] = tx
             nodes[size, 1] = ty
-            nodes[size, 2] = length + leg
+            nodes[size, 2] += math.hypot(tx - x, ty - y)
+            sides[size] = sides[best]
             if best == 0:
+                nodes[size, 2] += _change(tx, ty, stop[0], stop[1], way, side, steadiness)
                 nodes[size, 3] = tx
                 nodes[size, 4] = ty
-                first_side[size] = way
-                # Turning the motion costs way, and so does a change of mind.
-                nodes[size, 2] += 0.5 * (math.hypot(vx, vy) - (vx * tx + vy * ty) / leg)
-                if side == -way:
-                    nodes[size, 2] += mind
-                nodes[size, 2] += 0.1 * abs(math.atan2(ty, tx))
-            else:
-                nodes[size, 3] = nodes[best, 3]
-                nodes[size, 4] = nodes[best, 4]
-                first_side[size] = first_side[best]
-            nodes[size, 5] = nodes[size, 2] + math.hypot(goal_x - tx, goal_y - ty)
+                sides[size] = way
+            nodes[size, 5] = nodes[size, 2] + math.hypot(gx - tx, gy - ty)
             size += 1
 
 
@@ -216,5 +235,29 @@ def steer(
     robot = settings.robot
     most = robot.gear / (robot.gear * robot.gear + robot.yaw_drag) * robot.physics_step * robot.substeps
     turn = min(max(0.7 * error / most, -1.0), 1.0)
-    thrust = min(max(settings.eager * math.cos(error), -1.0), 1.0)
+    thrust = min(max(settings.eagerness * math.cos(error), -1.0), 1.0)
     return thrust, turn
+
+
+@compiled
+def drives_round(
+    settings: Settings, discs: FloatArray, count: int, state: State, action: FloatArray, way: Path
+) -> bool:
+    """Whether an action (u1, u2) leads past the disc in the way by itself.
+
+    It does if it thrusts roughly along the way round, and motion and thrust lead past every disc.
+    """
+    robot = settings.robot
+    after = stopping(robot, advance(robot, state, action[0], action[1], robot.substeps))
+    heading = after.heading if action[0] >= 0.0 else after.heading + math.pi
+    x = after.zx + settings.lookahead * math.cos(heading)
+    y = after.zy + settings.lookahead * math.sin(heading)
+    if abs(action[0]) < 0.5 * robot.force_limit:
+        return False
+    # Thrust away from the disc is no way round it.
+    toward = way.x * math.cos(heading) + way.y * math.sin(heading)
+    if toward < _ALONG * math.hypot(way.x, way.y):
+        return False
+    if first_hit(discs, count, after.x, after.y, after.zx, after.zy, -1)[0] >= 0:
+        return False
+    return first_hit(discs, count, after.zx, after.zy, x, y, -1)[0] < 0

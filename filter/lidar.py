@@ -1,14 +1,14 @@
 """What the pseudo-lidar leaves possible: every place in which a hazard can be, given the readings.
 
-A hazard at distance d in bin b, at the share alpha of the bin's width, gives the reading s = 1 - d / 3 to its own
-bin, alpha s to the next and (1 - alpha) s to the one before, and a bin shows the largest of what it is given.
-So whatever else there is, a hazard in bin b obeys
+A hazard at distance d in bin b, at the share alpha of the bin's width, gives the reading s = 1 - d / 3 to
+its own bin, alpha s to the next and (1 - alpha) s to the one before, and a bin shows the largest of what it
+is given. So whatever else there is, a hazard in bin b obeys
 
     s <= R[b],   alpha s <= R[b + 1],   (1 - alpha) s <= R[b - 1].
 
-For each s the share alpha is thus in [1 - R[b-1] / s, R[b+1] / s]: one point where a single hazard is alone, and
-a wedge that widens with the distance behind it, where others could hide. The union over the bins holds every
-hazard within the lidar's range, aliasing and hazards that share a bin included.
+For each s the share alpha is thus in [1 - R[b-1] / s, R[b+1] / s]: one point where a single hazard is alone,
+and a wedge that widens with the distance behind it, where others could hide. The union over the bins holds
+every hazard within the lidar's range, aliasing and hazards that share a bin included.
 """
 
 from __future__ import annotations
@@ -26,8 +26,10 @@ IntArray = NDArray[np.int64]
 
 PIECES = 4
 """Pieces along the range that a bin's region is cut into."""
-SPLITS = 3
+SPLITS = 8
 """Pieces across the bin's width, at most."""
+_WASTE = 0.004
+"""How much nearer than its region a cone may come for its round front [m]; more far off."""
 CONES = LIDAR_BINS * PIECES * SPLITS
 """The most obstacles that one scan gives."""
 _EDGES = (0.0, 0.12, 0.35, 0.8)
@@ -36,7 +38,7 @@ _ROUNDING = 1e-9
 
 @compiled
 def shares(reading: float, before: float, after: float) -> tuple[float, float]:
-    """The shares of the bin's width in which a hazard of this reading can be, given the neighbours' readings."""
+    """The shares of the bin's width in which a hazard of this reading can be, given the neighbours'."""
     low = max(1.0 - before / reading - _ROUNDING, 0.0)
     high = min(after / reading + _ROUNDING, 1.0)
     return low, high
@@ -63,7 +65,7 @@ def decode(
     for b in range(LIDAR_BINS):
         before = readings[(b + LIDAR_BINS - 1) % LIDAR_BINS]
         after = readings[(b + 1) % LIDAR_BINS]
-        strongest = min(readings[b], before + after)
+        strongest = min(readings[b], before + after, 1.0)
         if strongest <= 0.0:
             continue
         nearest = LIDAR_RANGE * (1.0 - strongest)
@@ -94,19 +96,22 @@ def _cover(
     """Cover the part of a bin's region between two distances [m] with cones side by side.
 
     Over the distance the upper share is convex and the lower one concave, so straight lines between the ends
-    hold the region; ``bend`` is what a cone's straight axis misses of a bearing that is linear in the distance.
+    hold the region; ``bend`` is what a cone's straight axis misses of a bearing that is linear in the
+    distance.
     """
     weakest = max(1.0 - end / LIDAR_RANGE, 1e-6)
     low, high = shares(weakest, before, after)
     near_low, near_high = shares(1.0 - start / LIDAR_RANGE, before, after)
     if near_low > near_high:
         near_low = near_high = 0.5 * (near_low + near_high)
-    # Between the two ends the region lies within straight lines, unless the bin's own edge cuts it on the way.
+    # Between the two ends the region lies within straight lines, unless the bin's own edge cuts it on the
+    # way.
     if low <= 0.0:
         near_low = 0.0
     if high >= 1.0:
         near_high = 1.0
-    parts = min(max(math.ceil((high - low) * SPLITS), 1), SPLITS)
+    waste = _WASTE + 0.1 * max(start - grow, 0.0)
+    parts = min(max(math.ceil((near_high - near_low) * BIN_WIDTH * start / (2.0 * waste)), 1), SPLITS)
     for part in range(parts):
         left = low + (high - low) * part / parts
         right = low + (high - low) * (part + 1) / parts
@@ -115,20 +120,19 @@ def _cover(
         close_right = min(max(right, near_low), near_high)
         first = (b + 0.5 * (close_left + close_right)) * BIN_WIDTH
         last = (b + 0.5 * (left + right)) * BIN_WIDTH
-        cone = out[count]
-        cone[0] = start * math.cos(first)
-        cone[1] = start * math.sin(first)
-        cone[2] = end * math.cos(last) - cone[0]
-        cone[3] = end * math.sin(last) - cone[1]
+        out[count, 0] = start * math.cos(first)
+        out[count, 1] = start * math.sin(first)
+        out[count, 2] = end * math.cos(last) - out[count, 0]
+        out[count, 3] = end * math.sin(last) - out[count, 1]
         if end - start < 1e-9:
-            cone[2] = 0.0
-            cone[3] = 0.0
+            out[count, 2] = 0.0
+            out[count, 3] = 0.0
         shift = abs(last - first)
         bend = 0.25 * shift * (end - start) + 0.125 * end * shift * shift
-        cone[4] = grow + bend + start * (0.5 * (close_right - close_left) * BIN_WIDTH + spread)
+        out[count, 4] = grow + bend + start * (0.5 * (close_right - close_left) * BIN_WIDTH + spread)
         far = grow + bend + end * (0.5 * (right - left) * BIN_WIDTH + spread)
-        cone[5] = far - cone[4]
-        cone[6] = gap(cone, 0.0, 0.0)
+        out[count, 5] = far - out[count, 4]
+        out[count, 6] = gap(out, count, 0.0, 0.0)
         source[count] = b
         count += 1
     return count
@@ -153,7 +157,8 @@ def decode_goal(readings: FloatArray) -> tuple[bool, float, float]:
 def likeliest(readings: FloatArray, radius: float, out: FloatArray, source: IntArray) -> int:
     """One disc for each hazard that the readings tell apart: a guess to plan with, not to be safe by.
 
-    A bin that shows more than its neighbours' hazards explain has one of its own, in the middle of where it can be.
+    A bin that shows more than its neighbours' hazards explain has one of its own, in the middle of where it
+    can be.
 
     Args:
         readings: (16,) the hazards' lidar.
@@ -168,7 +173,7 @@ def likeliest(readings: FloatArray, radius: float, out: FloatArray, source: IntA
     for b in range(LIDAR_BINS):
         before = readings[(b + LIDAR_BINS - 1) % LIDAR_BINS]
         after = readings[(b + 1) % LIDAR_BINS]
-        strongest = min(readings[b], before + after)
+        strongest = min(readings[b], before + after, 1.0)
         spill = max(
             before - readings[(b + LIDAR_BINS - 2) % LIDAR_BINS], after - readings[(b + 2) % LIDAR_BINS]
         )

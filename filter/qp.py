@@ -1,12 +1,14 @@
 """The quadratic programme: the least change of the action that keeps every barrier from falling too fast.
 
-The variables are the true inputs, x = (u1 / 0.05, u2): the share of full thrust, which saturates at 1, and the turn.
+The variables are the true inputs, x = (u1 / 0.05, u2): the share of full thrust, which saturates at 1, and
+the turn.
 
     minimise   (x - r)^T P (x - r) / 2    subject to   G x <= h,   -1 <= x <= 1
 
-r is the reference, P the weights. Row i says h_i(x+) >= (1 - rate) h_i(x) for obstacle i, where h_i is the clearance
-of a backup manoeuvre (a backup control barrier function), x+ the state after one exact control step, and h_i(x+) is
-linearised in the inputs about the reference. Building and solving are apart: see `solvers`.
+r is the reference, P the weights. Row i says h_i(x+) >= (1 - rate) h_i(x) for obstacle i, where h_i is the
+clearance of a backup manoeuvre (a backup control barrier function), x+ the state after one exact control
+step, and h_i(x+) is linearised in the inputs about the reference. Building and solving are apart: see
+`solvers`.
 """
 
 from __future__ import annotations
@@ -19,6 +21,7 @@ from numpy.typing import NDArray
 from filter.backups import best_backup, clearances
 from filter.compiled import compiled
 from filter.config import Settings
+from filter.obstacles import FAR
 from filter.robot import State, Stopping, advance, stopping
 
 FloatArray = NDArray[np.float64]
@@ -44,7 +47,7 @@ class Problem:
     h: FloatArray
 
     def residual(self, x: FloatArray) -> float:
-        """Largest violation of a row, scaled to a normal of length 1 or more, or of the box; 0 if there is none."""
+        """Largest violation of a row, scaled to a normal of at least length 1, or of the box; 0 if none."""
         scale = np.maximum(np.linalg.norm(self.G, axis=1), 1.0)
         rows = ((self.G @ x - self.h) / scale).max(initial=0.0)
         return float(max(rows, (np.abs(x) - 1.0).max(), 0.0))
@@ -67,10 +70,10 @@ def build_rows(
     obstacles: FloatArray,
     count: int,
     state: State,
+    best: tuple[float, int, int, int],
     reference: FloatArray,
     G: FloatArray,
     h: FloatArray,
-    origin: NDArray[np.int64],
     work: FloatArray,
 ) -> int:
     """Write the rows of one robot's QP.
@@ -80,23 +83,22 @@ def build_rows(
         obstacles: (M, COLUMNS), radii with the margin.
         count: how many of them there are.
         state: the measured state.
+        best: its best backup, see `best_backup`.
         reference: (2,) about which to linearise.
         G: (>= M, 2) receives the rows that can bind in the box.
         h: (>= M,) receives their right-hand sides.
-        origin: (>= M,) receives each row's obstacle.
         work: (4, >= M) scratch.
 
     Returns:
         How many rows there are.
     """
     now = stopping(settings.robot, state)
-    _, _, kind, steps = best_backup(settings, obstacles, count, now, 1e9)
-    clearances(settings, kind, steps, obstacles, count, now, work[0])
+    clearances(settings, best[2], best[3], obstacles, count, now, work[0])
     f, w = reference
     df = _PROBE if f < 0.0 else -_PROBE
     dw = _PROBE if w < 0.0 else -_PROBE
     at = _after(settings, state, f, w)
-    _, _, kind, steps = best_backup(settings, obstacles, count, at, 1e9)
+    _, _, kind, steps = best_backup(settings, obstacles, count, at, FAR)
     clearances(settings, kind, steps, obstacles, count, at, work[1])
     clearances(settings, kind, steps, obstacles, count, _after(settings, state, f + df, w), work[2])
     clearances(settings, kind, steps, obstacles, count, _after(settings, state, f, w + dw), work[3])
@@ -115,6 +117,5 @@ def build_rows(
             G[rows, 0] = -gf
             G[rows, 1] = -gw
             h[rows] = bound
-            origin[rows] = i
             rows += 1
     return rows

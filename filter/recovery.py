@@ -1,8 +1,10 @@
-"""The way out when nothing is certified: the manoeuvre that is least deep in, and soonest clear of, any obstacle.
+"""What to do when nothing is certified: the committed backup, or the way out.
 
-It is used inside a hazard, at a speed that no backup can hold, and where the sensors' errors have eaten the margin.
-The backups are among the candidates, so while one of them is still good it is what is committed to; the others
-turn to one of a ring of headings and thrust, forwards or backwards, once they point roughly there.
+While a backup still keeps out of the hazards, though not all of the margin, the action that leaves the most
+clearance is taken: that continues what was certified last. Inside a hazard, and at a speed that no backup
+can hold, it is the manoeuvre that gets least deeper, is least deep, and is soonest clear. The backups are
+among its candidates; the others turn to one of a ring of headings and thrust, forwards or backwards, once
+they point roughly there.
 """
 
 from __future__ import annotations
@@ -13,10 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from filter.backups import BACKUPS, law
+from filter.certificate import certify
 from filter.compiled import compiled
 from filter.config import Settings
-from filter.obstacles import FAR, least_gap
-from filter.robot import State, Stopping, follow, stopping
+from filter.obstacles import FAR, gap, least_gap
+from filter.robot import State, Stopping, advance, follow, stopping
 
 FloatArray = NDArray[np.float64]
 
@@ -50,46 +53,91 @@ def _control(settings: Settings, candidate: int, heading: float, at: Stopping) -
 
 
 @compiled
+def _depths(settings: Settings, obstacles: FloatArray, count: int, x: float, y: float) -> tuple[float, float]:
+    """How deep a point is in the obstacles, and how much deeper than the origin, summed over them [m]."""
+    depth = 0.0
+    deeper = 0.0
+    out = math.sqrt(x * x + y * y)
+    for i in range(count):
+        if obstacles[i, 6] - out >= settings.keep_off:
+            continue
+        inside = -gap(obstacles, i, x, y)
+        depth += max(inside + settings.keep_off, 0.0)
+        deeper += max(inside - max(-obstacles[i, 6], 0.0), 0.0)
+    return depth, deeper
+
+
+@compiled
+def _first(settings: Settings, candidate: int, start: Stopping) -> tuple[float, float]:
+    """A candidate's first action (u1, u2)."""
+    robot = settings.robot
+    thrust, turn = _control(settings, candidate, start.heading, start)
+    most = robot.gear / (robot.gear * robot.gear + robot.yaw_drag) * robot.physics_step * robot.substeps
+    return thrust * robot.force_limit, turn / most
+
+
+@compiled
 def _harm(
-    settings: Settings, obstacles: FloatArray, count: int, start: Stopping, candidate: int, least: float
+    settings: Settings, obstacles: FloatArray, count: int, state: State, candidate: int, least: float
 ) -> float:
-    """Depth [m] below ``keep_off``, summed over a candidate's steps, and the delay until it may coast clear."""
-    seconds = settings.robot.physics_step * settings.robot.substeps
-    at = start
+    """What a candidate does: depth over its steps, delay until it may coast clear, and getting deeper.
+
+    The first step is the exact model's, for the servo cannot reverse a turn at once.
+    """
+    robot = settings.robot
+    seconds = robot.physics_step * robot.substeps
+    start = stopping(robot, state)
+    thrust, turn = _first(settings, candidate, start)
+    at = stopping(robot, advance(robot, state, thrust, turn, robot.substeps))
     harm = 0.0
-    nearest = -1
     deepest = 0.0
-    for step in range(_STEPS):
-        gap, nearest = least_gap(obstacles, count, at.x, at.y, at.x, at.y, nearest, -FAR)
-        if step == 0:
-            deepest = max(-gap, 0.0)
-        harm += max(settings.keep_off - gap, 0.0) + _DELAY + _DEEPER * max(-gap - deepest, 0.0)
-        deepest = max(deepest, -gap)
+    for _ in range(_STEPS):
+        depth, deeper = _depths(settings, obstacles, count, at.x, at.y)
+        harm += depth + _DELAY + _DEEPER * max(deeper - deepest, 0.0)
+        deepest = max(deeper, deepest)
         if harm >= least:
             return harm
-        if gap >= 0.0:
-            rest, _ = least_gap(obstacles, count, at.x, at.y, at.zx, at.zy, nearest, 0.0)
-            if rest >= 0.0:
-                return harm
+        if depth == 0.0 and least_gap(obstacles, count, at.x, at.y, at.zx, at.zy, -1, 0.0)[0] >= 0.0:
+            return harm
         thrust, turn = _control(settings, candidate, start.heading, at)
-        at = follow(settings.robot, at, thrust, turn, seconds)
+        at = follow(robot, at, thrust, turn, seconds)
     # Still not clear: what is left of the motion counts as well.
-    rest, _ = least_gap(obstacles, count, at.x, at.y, at.zx, at.zy, nearest, -FAR)
-    return harm + _DEEPER * max(-rest - deepest, 0.0) + _STEPS * max(-rest, 0.0)
+    depth, deeper = _depths(settings, obstacles, count, at.zx, at.zy)
+    return harm + _STEPS * depth + _DEEPER * max(deeper - deepest, 0.0)
+
+
+@compiled
+def commit(settings: Settings, obstacles: FloatArray, count: int, state: State) -> tuple[float, float]:
+    """The first action (u1, u2) that leaves the most clearance, of the backups' and of the extreme ones.
+
+    It is for a state whose backups still keep out of the hazards, if not all of the margin.
+    """
+    limit = settings.robot.force_limit
+    start = stopping(settings.robot, state)
+    most = -FAR
+    best_thrust = best_turn = 0.0
+    for candidate in range(BACKUPS + 9):
+        if candidate < BACKUPS:
+            thrust, turn = _first(settings, candidate, start)
+        else:
+            thrust = limit * ((candidate - BACKUPS) // 3 - 1.0)
+            turn = (candidate - BACKUPS) % 3 - 1.0
+        value = certify(settings, obstacles, count, state, thrust, turn, FAR)[0]
+        if value > most:
+            most = value
+            best_thrust = thrust
+            best_turn = turn
+    return best_thrust, best_turn
 
 
 @compiled
 def drive_out(settings: Settings, obstacles: FloatArray, count: int, state: State) -> tuple[float, float]:
     """The first action (u1, u2) of the least harmful candidate."""
-    start = stopping(settings.robot, state)
     least = FAR
     best = BACKUPS
     for candidate in range(BACKUPS + 1 + 2 * HEADINGS):
-        harm = _harm(settings, obstacles, count, start, candidate, least)
+        harm = _harm(settings, obstacles, count, state, candidate, least)
         if harm < least:
             least = harm
             best = candidate
-    robot = settings.robot
-    thrust, turn = _control(settings, best, start.heading, start)
-    most = robot.gear / (robot.gear * robot.gear + robot.yaw_drag) * robot.physics_step * robot.substeps
-    return thrust * robot.force_limit, turn / most
+    return _first(settings, best, stopping(settings.robot, state))

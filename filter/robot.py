@@ -1,8 +1,9 @@
 """The point robot's dynamics: the exact control step, and the reduced model in which it stops in closed form.
 
-The robot is a hovercraft: thrust along its heading, a stiff servo on the yaw rate, linear drag, and a centre of
-mass ahead of its origin, which couples yaw and sideways motion. All is in the plane, in a frame that stands
-still and coincides with the body at the moment of the decision: the origin at (0, 0), the heading along x.
+The robot is a hovercraft: thrust along its heading, a stiff servo on the yaw rate, linear drag, and a centre
+of mass ahead of its origin, which couples yaw and sideways motion. All is in the plane, in a frame that
+stands still and coincides with the body at the moment of the decision: the origin at (0, 0), the heading
+along x.
 """
 
 from __future__ import annotations
@@ -82,9 +83,10 @@ class Stopping(NamedTuple):
     """The reduced state: where the robot is, where it would come to rest without thrust, and its heading.
 
     Without thrust the momentum decays through drag alone, so the origin comes to rest exactly at
-    p + tau * v_c, with v_c the velocity of the centre of mass and tau the time constant, however it turns on the
-    way. This stop point obeys dz/dt = V f e(heading), f in [-1, 1] the share of full thrust and V = `stop_speed`:
-    no drift; and the robot follows it, dp/dt = (z - p) / tau - c de/dt, c the offset of the centre of mass.
+    p + tau * v_c, with v_c the velocity of the centre of mass and tau the time constant, however it turns on
+    the way. This stop point obeys dz/dt = V f e(heading), f in [-1, 1] the share of full thrust and V =
+    `stop_speed`: no drift; and the robot follows it, dp/dt = (z - p) / tau - c de/dt, c the offset of the
+    centre of mass.
     """
 
     x: float

@@ -1,4 +1,4 @@
-"""Solvers of the QP: one of our own, exact in two variables; OSQP with a kept workspace; any that qpsolvers knows."""
+"""Solvers of the QP: our own, exact in two variables; OSQP with a kept workspace; any of qpsolvers."""
 
 from __future__ import annotations
 
@@ -74,8 +74,9 @@ def solve_planar(
 ) -> bool:
     """Solve one QP exactly, constraint by constraint.
 
-    In the variables y = sqrt(P) x the QP asks for the point nearest to the reference. The rows are taken in turn: if
-    the best point so far breaks the next, the new best point lies on that row's line (Seidel 1991, "Small-dimensional
+    In the variables y = sqrt(P) x the QP asks for the point nearest to the reference. The rows are taken in
+    turn: if the best point so far breaks the next, the new best point lies on that row's line (Seidel 1991,
+        "Small-dimensional
     linear programming and convex hulls made easy"; it holds for every LP-type problem).
 
     Args:
@@ -112,7 +113,7 @@ def solve_planar(
     return True
 
 
-def _entries() -> Callable[..., None]:
+def _solve_entry() -> Callable[..., None]:
     sources = SOURCES
 
     @entry
@@ -125,7 +126,7 @@ def _entries() -> Callable[..., None]:
         x: FloatArray,
         solved: NDArray[np.bool_],
     ) -> None:
-        """Solve N problems: (N, 2), (N, M, 2), (N, M), (N,) -> (N, 2), (N,). A negative row count is skipped."""
+        """Solve N problems: (N, 2), (N, M, 2), (N, M), (N,) -> (N, 2), (N,). Negative rows: skipped."""
         if not sources:
             return
         for k in range(rows.size):
@@ -134,7 +135,7 @@ def _entries() -> Callable[..., None]:
     return solve_batch
 
 
-solve_batch = _entries()
+solve_batch = _solve_entry()
 
 
 def planar(problem: Problem) -> FloatArray | None:
@@ -177,7 +178,7 @@ def through_qpsolvers(name: str) -> Solver:
     return solve
 
 
-def solver(name: str) -> Solver:
+def make_solver(name: str) -> Solver:
     """The solver of a name.
 
     Raises:
