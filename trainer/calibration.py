@@ -1,10 +1,13 @@
 """The threshold on λ above which the gate opens, from closed-loop episodes.
 
 Whole episodes are scored, not steps, for the steps of an episode are not exchangeable. The score S of an
-episode with a violation is the largest λ up to a lead time before its first one: a threshold below S opens
-the gate in time. Of n such episodes, with scores S_(1) ≤ … ≤ S_(n), the threshold S_(k) misses a new
-violating episode with probability at most α, with confidence 1 − δ, when BinomCDF(k − 1; n, α) ≤ δ (the
-order statistic's exact law).
+episode with violations is the smallest λ in the lead time before each of them begins: a threshold below S has
+the gate open all the time that the filter needs, every time. (The largest λ before the first violation, the
+weaker score, is reached in passing a hazard well, and leaves the gate closed when it counts: a filter that
+acts too late does worse than none.) Of n such episodes, with scores S_(1) ≤ … ≤ S_(n), the threshold S_(k)
+misses a new violating episode with probability at most α, with confidence 1 − δ, when BinomCDF(k − 1; n, α) ≤ δ
+(the order statistic's exact law). The filter changes the states that are visited, so this says nothing of the
+closed loop with the filter in it: `lagnet-evaluate --gate risk` measures that.
 """
 
 from dataclasses import dataclass
@@ -13,8 +16,8 @@ from math import comb
 import numpy as np
 import numpy.typing as npt
 
-LEAD = 0.4
-"""Lead time the filter needs [s]: stopping from top speed takes up to that."""
+LEAD = 0.6
+"""Lead time the filter needs [s]: to turn, and to stop from top speed."""
 STEP = 0.02
 """Duration of a control step [s]."""
 MISS = 0.05
@@ -44,15 +47,16 @@ def scores(multiplier: npt.NDArray[np.floating], cost: npt.NDArray[np.floating])
         cost: of each step [T, E]; NaN after an episode's end.
 
     Returns:
-        [n], in the episodes' order; −∞ where the first violation came before the lead time had passed.
+        [n], in the episodes' order; −∞ where a violation begins before the lead time has passed.
     """
     lead = round(LEAD / STEP)
     found = []
     for episode in range(cost.shape[1]):
-        violations = np.flatnonzero(cost[:, episode] > 0)
-        if violations.size:
-            early = multiplier[: max(0, violations[0] - lead + 1), episode]
-            found.append(float(early.max()) if early.size else -np.inf)
+        violating = cost[:, episode] > 0
+        begins = np.flatnonzero(violating & ~np.r_[False, violating[:-1]])
+        if begins.size:
+            windows = [multiplier[max(0, begin - lead) : begin + 1, episode].min() for begin in begins]
+            found.append(float(min(windows)) if begins[0] >= lead else -np.inf)
     return np.asarray(found, np.float64)
 
 
@@ -90,10 +94,10 @@ def calibrate(multiplier: npt.NDArray[np.floating], cost: npt.NDArray[np.floatin
     value = float(np.nextafter(np.float32(found[k - 1]), np.float32(0)))
     if not np.isfinite(value) or value <= 0:
         return Threshold(
-            0.0, f"gate always open: {k} of {n} violating episodes were not announced {LEAD} s ahead"
+            0.0, f"gate always open: λ was not above 0 for {LEAD} s ahead in {k} of {n} violating episodes"
         )
     return Threshold(
         value,
-        f"exact binomial: at most {MISS:.0%} of violating episodes announced later than {LEAD} s ahead, "
+        f"exact binomial: open for {LEAD} s ahead of every violation in all but {MISS:.0%} of violating episodes, "
         f"confidence {1 - DOUBT:.0%}, from {n} violating of {cost.shape[1]} episodes (rank {k})",
     )

@@ -15,12 +15,22 @@ def test_the_published_sample_sizes():
     assert [rank(n) for n in (58, 59, 92, 93)] == [0, 1, 1, 2]
 
 
-def test_scores_look_no_later_than_the_lead_before_the_first_violation():
-    multiplier = np.tile(np.arange(100.0)[:, None], (1, 3))
-    cost = np.zeros((100, 3))
-    cost[50, 0] = cost[70, 0] = 0.1  # first violation in step 50: 20 steps before is step 30
+def test_the_score_is_the_least_multiplier_in_the_lead_before_any_violation():
+    multiplier = np.tile(np.arange(100.0)[:, None], (1, 4))
+    multiplier[60, 2] = 7.0
+    cost = np.zeros((100, 4))
+    cost[50:60, 0] = cost[90, 0] = 0.1  # 0.6 s are 30 steps: from step 20 on
     cost[5, 1] = 0.1  # before any lead
-    np.testing.assert_array_equal(scores(multiplier, cost), [30.0, -np.inf])
+    cost[50, 2] = cost[70, 2] = 0.1  # the second one's lead has the least
+    np.testing.assert_array_equal(scores(multiplier, cost), [20.0, -np.inf, 7.0])
+
+
+def test_a_violation_without_end_is_one():
+    multiplier = np.ones((100, 1))
+    multiplier[70:] = 0.0
+    cost = np.zeros((100, 1))
+    cost[50:] = 0.1
+    np.testing.assert_array_equal(scores(multiplier, cost), [1.0])
 
 
 def test_enough_episodes_give_a_threshold_that_catches_the_worst_of_them():
