@@ -5,8 +5,8 @@ episode with violations is the smallest λ in the lead time before each of them 
 the gate open all the time that the filter needs, every time. (The largest λ before the first violation, the
 weaker score, is reached in passing a hazard well, and leaves the gate closed when it counts: a filter that
 acts too late does worse than none.) Of n such episodes, with scores S_(1) ≤ … ≤ S_(n), the threshold S_(k)
-misses a new violating episode with probability at most α, with confidence 1 − δ, when BinomCDF(k − 1; n, α) ≤ δ
-(the order statistic's exact law). The filter changes the states that are visited, so this says nothing of the
+misses a new violating episode with probability at most α, with confidence 1 − δ, when
+BinomCDF(k − 1; n, α) ≤ δ (the order statistic's exact law). The filter changes the states that are visited, so this says nothing of the
 closed loop with the filter in it: `lagnet-evaluate --gate risk` measures that.
 """
 
@@ -98,6 +98,6 @@ def calibrate(multiplier: npt.NDArray[np.floating], cost: npt.NDArray[np.floatin
         )
     return Threshold(
         value,
-        f"exact binomial: open for {LEAD} s ahead of every violation in all but {MISS:.0%} of violating episodes, "
-        f"confidence {1 - DOUBT:.0%}, from {n} violating of {cost.shape[1]} episodes (rank {k})",
+        f"exact binomial: open for {LEAD} s ahead of every violation in all but {MISS:.0%} of violating "
+        f"episodes, confidence {1 - DOUBT:.0%}, from {n} violating of {cost.shape[1]} episodes (rank {k})",
     )
