@@ -1,13 +1,13 @@
 """The threshold on λ above which the gate opens, from closed-loop episodes.
 
 Whole episodes are scored, not steps, for the steps of an episode are not exchangeable. The score S of an
-episode with violations is the smallest λ in the lead time before each of them begins: a threshold below S has
-the gate open all the time that the filter needs, every time. (The largest λ before the first violation, the
-weaker score, is reached in passing a hazard well, and leaves the gate closed when it counts: a filter that
-acts too late does worse than none.) Of n such episodes, with scores S_(1) ≤ … ≤ S_(n), the threshold S_(k)
-misses a new violating episode with probability at most α, with confidence 1 − δ, when
-BinomCDF(k − 1; n, α) ≤ δ (the order statistic's exact law). The filter changes the states that are visited, so this says nothing of the
-closed loop with the filter in it: `lagnet-evaluate --gate risk` measures that.
+episode with violations is the smallest λ in the lead time before each of them begins: a threshold below S
+has the gate open all the time that the filter needs, every time. (The largest λ before the first violation,
+the weaker score, is reached in passing a hazard well, and leaves the gate closed when it counts: a filter
+that acts too late does worse than none.) Of n such episodes, with scores S_(1) ≤ … ≤ S_(n), the threshold
+S_(k) misses a new violating episode with probability at most α, with confidence 1 − δ, when BinomCDF(k − 1;
+n, α) ≤ δ (the order statistic's exact law). The filter changes the states that are visited, so this says
+nothing of the closed loop with the filter in it: `lagnet-evaluate --gate risk` measures that.
 """
 
 from dataclasses import dataclass
