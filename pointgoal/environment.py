@@ -116,6 +116,11 @@ class PointGoalEnv(gymnasium.Env[FloatArray, FloatArray]):
         """(h, 2) centres of the hazards [m]."""
         return _first(self.simulation.hazards)
 
+    @property
+    def elapsed_steps(self) -> int:
+        """Steps since the episode's start."""
+        return int(self.simulation.elapsed_steps[0])
+
 
 def _first(rows: FloatArray) -> FloatArray:
     row: FloatArray = rows[0]

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from pointgoal.layouts import EXTENT
 from pointgoal.observation import BIN_WIDTH, HAZARD_RADIUS, LIDAR_BINS, FloatArray
-
-if TYPE_CHECKING:
-    from pointgoal.simulation import Simulation
+from pointgoal.scene import VASE_SIZE
+from pointgoal.simulation import GOAL_RADIUS, Simulation
 
 PICTURE_SIZE = 480
 """Width and height of a picture [pixels]."""
@@ -95,12 +92,12 @@ def draw(simulation: Simulation, row: int, cost: float) -> np.ndarray:
     edge = reach - 0.3
     canvas = _Canvas(position - np.clip(position, -edge, edge), reach)
     canvas.tiles(0.5)
-    canvas.disc(simulation.goal[row], 0.3, _GOAL, 0.35, rim=0.015)
+    canvas.disc(simulation.goal[row], GOAL_RADIUS, _GOAL, 0.35, rim=0.015)
     for hazard in simulation.hazards[row]:
         canvas.disc(hazard, HAZARD_RADIUS, _HAZARD, 0.35, rim=0.015)
     for vase in simulation.vases[row]:
         yaw = 2 * np.arctan2(vase[6], vase[3])
-        canvas.polygon(vase[:2] + _box(0.1, yaw), _VASE, 0.9)
+        canvas.polygon(vase[:2] + _box(VASE_SIZE, yaw), _VASE, 0.9)
     if cost > 0:
         canvas.disc(position, 0.32, _COST, 0.15, rim=0.02)
     _draw_robot(canvas, position, heading)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 from pointgoal.observation import FloatArray, ObservationLayout, layout
 from pointgoal.rendering import draw
 from pointgoal.scene import build_scene
-from pointgoal.simulation import CostKind, Simulation, State, StepResult
+from pointgoal.simulation import EPISODE_STEPS, CostKind, Simulation, State, StepResult
 
 
 def observation_space(observation_layout: ObservationLayout) -> spaces.Space[FloatArray]:
@@ -69,6 +70,8 @@ class PointGoalVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
     ) -> None:
         if num_envs < 1:
             raise ValueError(f"num_envs must be at least 1, got {num_envs}")
+        if num_threads < 0:
+            raise ValueError(f"num_threads must be at least 0, got {num_threads}")
         self.level = level
         self.num_envs = num_envs
         self.render_mode = render_mode
@@ -92,7 +95,8 @@ class PointGoalVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
         """Start new episodes.
 
         Args:
-            seed: one number s (row i takes s + i), or one a row, or None to go on with the generators.
+            seed: one number s (row i takes s + i), or one a row, or None to go on with the generators; rows
+                that are not reset keep theirs.
             options: ``"state"``: an exact state (pose, velocity, goal, hazards, vase_qpos, vase_qvel,
                 each with leading axis N); ``"reset_mask"`` (N,) bool: the rows to reset, the others stay
                 as they are; ``"elapsed_steps"`` (N,) int: how far into its episode each row starts, to
@@ -110,7 +114,6 @@ class PointGoalVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
         if options:
             known = ["elapsed_steps", "reset_mask", "state"]
             raise ValueError(f"reset has no options {sorted(options)}; it takes {known}")
-        self._seed(seed)
         chosen = (
             np.ones(self.num_envs, bool) if mask is None else _rows(mask, bool, self.num_envs, "reset_mask")
         )
@@ -120,8 +123,13 @@ class PointGoalVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
         steps = np.zeros(self.num_envs, np.int64)
         if elapsed is not None:
             steps = _rows(elapsed, np.int64, self.num_envs, "elapsed_steps")
+            if not ((steps >= 0) & (steps < EPISODE_STEPS)).all():
+                raise ValueError(f"elapsed_steps must be 0 to {EPISODE_STEPS - 1}, got {steps.tolist()}")
+        self._seed(seed, chosen)
         for simulation, part in zip(self.simulations, self._slices, strict=True):
             rows = np.flatnonzero(chosen[part])
+            if not len(rows):
+                continue
             if whole is None:
                 simulation.reset(rows)
                 simulation.elapsed_steps[rows] = steps[part][rows]
@@ -160,9 +168,9 @@ class PointGoalVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
         else:
             results = list(self._pool.map(Simulation.step, self.simulations, parts))
         result = StepResult.concatenate(results)
-        self._cost = result.cost
         info: dict[str, Any] = {"cost": result.cost}
         done = result.terminated | result.truncated
+        self._cost = np.where(done, 0.0, result.cost)
         if done.any():
             info["final_obs"], info["_final_obs"] = result.observation.copy(), done
             info["final_info"], info["_final_info"] = {"cost": result.cost, "_cost": done}, done
@@ -230,21 +238,22 @@ class PointGoalVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
         """
         for simulation, part in zip(self.simulations, self._slices, strict=True):
             simulation.load_state_dict({name: array[part] for name, array in state.items()})
-        self._cost = state["cost"].copy()
+        self._cost = _rows(state.get("cost"), np.float64, self.num_envs, "cost").copy()
         self._started = True
 
-    def _seed(self, seed: int | Sequence[int | None] | None) -> None:
+    def _seed(self, seed: int | Sequence[int | None] | None, chosen: NDArray[np.bool_]) -> None:
         if seed is None and self._started:
             return
+        seeds: list[int | None]
         if seed is None or isinstance(seed, int | np.integer):
             seeds = [None if seed is None else int(seed) + i for i in range(self.num_envs)]
         else:
-            seeds = list(seed)
+            seeds = [None if number is None else operator.index(number) for number in seed]
         if len(seeds) != self.num_envs:
             raise ValueError(f"seed has {len(seeds)} numbers, expected one or {self.num_envs}")
         for simulation, part in zip(self.simulations, self._slices, strict=True):
-            for row, number in enumerate(seeds[part]):
-                if number is not None or not self._started:
+            for row, (number, wanted) in enumerate(zip(seeds[part], chosen[part], strict=True)):
+                if wanted and (number is not None or not self._started):
                     simulation.rngs[row] = seeding.np_random(number)[0]
 
 

@@ -101,6 +101,62 @@ def test_an_episode_ends_after_1000_steps_and_starts_anew_in_the_same_step() -> 
     assert env.elapsed_steps.tolist() == [2, 0, 1]
 
 
+def test_an_episode_that_ends_does_not_touch_its_neighbours() -> None:
+    n, ends = 4, 2
+    plain, staggered = (PointGoalVectorEnv(level=1, num_envs=n, num_threads=1) for _ in range(2))
+    plain.reset(seed=3)
+    staggered.reset(seed=3, options={"elapsed_steps": np.where(np.arange(n) == ends, 995, 0)})
+    others = np.arange(n) != ends
+    rng = np.random.default_rng(0)
+    for step in range(10):
+        action = rng.uniform(-1, 1, (n, 2))
+        (ours, *_), (theirs, _, _, truncated, info) = plain.step(action), staggered.step(action)
+        np.testing.assert_array_equal(ours[others], theirs[others])
+        assert truncated.tolist() == [False, False, step == 4, False]
+        if step == 4:
+            np.testing.assert_array_equal(info["final_obs"], ours)
+
+
+@pytest.mark.parametrize("kind", ["single", "vector"])
+def test_a_goal_that_finds_no_place_ends_the_episode(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    met = exact_state(goal=[0.2, 0.0])
+    monkeypatch.setattr("pointgoal.simulation.sample_goal", lambda *_: None)
+    if kind == "single":
+        env = PointGoalEnv(level=1)
+        env.reset(seed=0, options={"state": met})
+        _, reward, terminated, truncated, _ = env.step(np.zeros(2))
+        assert (reward, terminated, truncated) == (pytest.approx(1.0), True, False)
+        with pytest.raises(RuntimeError, match="after the episode ended"):
+            env.step(np.zeros(2))
+        return
+    many = PointGoalVectorEnv(level=1, num_envs=2)
+    far = exact_state()
+    many.reset(seed=0, options={"state": {name: np.stack([met[name], far[name]]) for name in met}})
+    observation, rewards, terminations, _, info = many.step(np.zeros((2, 2)))
+    assert terminations.tolist() == info["_final_obs"].tolist() == [True, False]
+    assert rewards[0] == pytest.approx(1.0)
+    assert (info["final_obs"][0] != observation[0]).any()
+    assert many.elapsed_steps.tolist() == [0, 1]
+
+
+def test_reset_mask_leaves_the_others_generators_alone() -> None:
+    mask = np.array([True, False])
+    plain, seeded = PointGoalVectorEnv(level=1, num_envs=2), PointGoalVectorEnv(level=1, num_envs=2)
+    for env in (plain, seeded):
+        env.reset(seed=5)
+    seeded.reset(seed=99, options={"reset_mask": mask})
+    drawn = [env.reset()[0] for env in (plain, seeded)]
+    np.testing.assert_array_equal(drawn[0][1], drawn[1][1])
+    assert (drawn[0][0] != drawn[1][0]).any()
+
+
+@pytest.mark.parametrize("elapsed", [[0, -1], [0, 1000], [0]])
+def test_a_start_outside_the_episode_is_refused(elapsed: list[int]) -> None:
+    env = PointGoalVectorEnv(level=1, num_envs=2)
+    with pytest.raises(ValueError, match="elapsed_steps"):
+        env.reset(seed=0, options={"elapsed_steps": elapsed})
+
+
 def test_reset_mask_leaves_the_others_alone() -> None:
     env = PointGoalVectorEnv(level=1, num_envs=4, num_threads=2)
     env.reset(seed=0)
