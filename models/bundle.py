@@ -78,7 +78,8 @@ def write_bundle(path: str | Path, policy_onnx: bytes, multiplier_onnx: bytes, m
     """Writes a bundle beside its final place, loads it back, and only then renames it into place.
 
     Args:
-        path: the folder to create; an existing bundle there is replaced, any other folder is refused.
+        path: the folder to create; an existing bundle there is replaced, a folder that holds anything else
+            is refused.
         policy_onnx: the bytes of policy.onnx.
         multiplier_onnx: the bytes of multiplier.onnx.
         manifest: what to write as manifest.json; its sha256 is computed here.
@@ -90,8 +91,7 @@ def write_bundle(path: str | Path, policy_onnx: bytes, multiplier_onnx: bytes, m
         BundleError: if the place is taken or cannot be written, or the bundle would not load.
     """
     target = Path(path)
-    if target.exists() and not (target / MANIFEST_FILE).is_file():
-        raise BundleError(f"{target}: exists and is not a bundle; not replaced")
+    _check_replaceable(target)
     digests = {POLICY_FILE: _digest(policy_onnx), MULTIPLIER_FILE: _digest(multiplier_onnx)}
     complete = manifest.model_dump() | {"sha256": digests}
     try:
@@ -110,6 +110,19 @@ def write_bundle(path: str | Path, policy_onnx: bytes, multiplier_onnx: bytes, m
     except OSError as error:
         raise BundleError(f"{target}: cannot be written: {error.strerror or error}") from error
     return Bundle.load(target)
+
+
+def _check_replaceable(target: Path) -> None:
+    """What is not part of a bundle would be lost with the folder that it lies in."""
+    if not target.exists():
+        return
+    if not (target / MANIFEST_FILE).is_file():
+        raise BundleError(f"{target}: exists and is not a bundle; not replaced")
+    foreign = sorted(
+        {entry.name for entry in target.iterdir()} - {MANIFEST_FILE, POLICY_FILE, MULTIPLIER_FILE}
+    )
+    if foreign:
+        raise BundleError(f"{target}: holds {foreign[0]}, which is no part of a bundle; not replaced")
 
 
 def _check(fresh: Path, target: Path) -> None:
@@ -147,7 +160,7 @@ def _read(path: Path) -> bytes:
 def _parse_manifest(path: Path, text: bytes) -> Manifest:
     try:
         raw = json.loads(text)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise BundleError(f"{path}: not JSON: {error}") from error
     version = raw.get("format_version") if isinstance(raw, dict) else None
     if version != FORMAT_VERSION:
@@ -155,7 +168,7 @@ def _parse_manifest(path: Path, text: bytes) -> Manifest:
             f"{path}: format_version is {version!r}, this version of lagnet reads {FORMAT_VERSION}"
         )
     try:
-        return Manifest.model_validate(raw)
+        return Manifest.model_validate_json(text, strict=True)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         where = ".".join(str(part) for part in first["loc"])

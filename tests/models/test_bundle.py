@@ -88,6 +88,8 @@ def test_one_flipped_bit_is_noticed(own_bundle: Path, name: str) -> None:
         (lambda m: m.update(threshold=-0.1), "threshold"),
         (lambda m: m.update(threshold=math.nan), "threshold"),
         (lambda m: m.update(threshold=math.inf), "threshold"),
+        (lambda m: m.update(threshold=True), "threshold"),
+        (lambda m: m.update(threshold="0.5"), "threshold"),
         (lambda m: m.update(surprise=1), "surprise"),
         (lambda m: m.update(name="../../etc"), "name"),
         (lambda m: m.update(created="2026-01-01T00:00:00"), "created"),
@@ -106,7 +108,7 @@ def test_a_wrong_manifest_is_refused_with_its_field(own_bundle: Path, edit: Edit
     assert expected in refusal(own_bundle)
 
 
-@pytest.mark.parametrize("text", ["", "{", "[]", "null", '"x"', "\x00"])
+@pytest.mark.parametrize("text", ["", "{", "[]", "null", '"x"', "\x00", "[" * 100_000])
 def test_a_manifest_that_is_none_is_refused(own_bundle: Path, text: str) -> None:
     (own_bundle / "manifest.json").write_text(text)
     assert "manifest.json" in refusal(own_bundle)
@@ -195,6 +197,14 @@ def test_a_folder_that_is_no_bundle_is_not_replaced(own_bundle: Path, tmp_path: 
     with pytest.raises(BundleError, match="not a bundle"):
         write_bundle(thesis, bundle.policy, bundle.multiplier, bundle.manifest)
     assert (thesis / "chapter.tex").read_text() == "precious"
+
+
+def test_what_lies_in_a_bundles_folder_beside_it_is_not_lost(own_bundle: Path) -> None:
+    bundle = Bundle.load(own_bundle)
+    (own_bundle / "notes.txt").write_text("precious")
+    with pytest.raises(BundleError, match=r"notes\.txt"):
+        write_bundle(own_bundle, bundle.policy, bundle.multiplier, bundle.manifest)
+    assert (own_bundle / "notes.txt").read_text() == "precious"
 
 
 def test_a_bundle_that_would_not_load_is_not_written(own_bundle: Path, tmp_path: Path) -> None:
