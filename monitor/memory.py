@@ -20,6 +20,11 @@ def take(memory: FilterMemory, index: int) -> FilterMemory:
     return FilterMemory(**{name: getattr(memory, name)[index : index + 1] for name in _NAMES})
 
 
+def fits(memory: object, count: int) -> bool:
+    """Whether something is the memory of that many robots."""
+    return isinstance(memory, FilterMemory) and all(len(getattr(memory, name)) == count for name in _NAMES)
+
+
 def join(memories: Sequence[FilterMemory | None]) -> FilterMemory | None:
     """The memory of a batch from its robots' shares; None if any has none, for the filter works without."""
     known = [memory for memory in memories if memory is not None]

@@ -22,7 +22,7 @@ from filter import (
 from models import Bundle
 from monitor.decision import Decision, DecisionBatch
 from monitor.errors import MonitorError, NetworkError
-from monitor.memory import join, take
+from monitor.memory import fits, join, take
 from monitor.networks import FloatArray, Networks
 from pointgoal.observation import layout
 
@@ -121,7 +121,7 @@ class Monitor:
             path: the bundle's folder.
             gate: when the filter is active.
             threshold: λ above which the gate `risk` activates the filter; None takes the bundle's.
-            filter_config: the filter's settings; None takes the defaults.
+            filter_config: the filter's settings; None takes the defaults, with the bundle's hazard radius.
 
         Raises:
             BundleError: if the bundle must not be used.
@@ -132,7 +132,7 @@ class Monitor:
             networks = Networks(bundle)
         except NetworkError as error:
             raise MonitorError(f"{bundle.path}: {error}") from error
-        monitor = Monitor(bundle, networks, BarrierFilter(filter_config or FilterConfig()), gate, threshold)
+        monitor = Monitor(bundle, networks, _filter_of(bundle, filter_config), gate, threshold)
         monitor._warm_up()
         return monitor
 
@@ -152,9 +152,11 @@ class Monitor:
         """
         try:
             row = np.array(observation, dtype=np.float64)[None]
-            given = None if hazards is None else np.array(hazards, dtype=np.float64).reshape(1, -1, 2)
+            given = None if hazards is None else _one_robots_hazards(hazards)
         except _FAULTS as error:
             return self._fallback(1, f"bad input: {error}", memory)[0]
+        if memory is not None and not fits(memory, 1):
+            return self._fallback(1, "bad input: the memory is not that of one robot", None)[0]
         return self._decide_or_fall_back(row, given, memory)[0]
 
     def decide_batch(
@@ -170,8 +172,9 @@ class Monitor:
             memory: the `memory` of these robots' last decisions, or None.
 
         Raises:
-            ValueError: if the observation is not an array [N, O] of numbers, for then N is unknown. A fault
-                in one robot's row gives that robot the fallback and leaves the others alone.
+            ValueError: if the observation is not an array [N, O] of numbers, for then N is unknown, or the
+                hazards or the memory are not those of N robots. A fault in one robot's row gives that robot
+                the fallback and leaves the others alone.
         """
         rows = np.array(observation, dtype=np.float64)
         if rows.ndim != 2:
@@ -179,6 +182,10 @@ class Monitor:
                 f"observation must have shape [N, {self._networks.observation_size}], got {rows.shape}"
             )
         given = None if hazards is None else np.asarray(hazards, dtype=np.float64)
+        if given is not None and (given.ndim != 3 or given.shape[::2] != (len(rows), 2)):
+            raise ValueError(f"hazards must have shape [{len(rows)}, n, 2], got {given.shape}")
+        if memory is not None and not fits(memory, len(rows)):
+            raise ValueError(f"memory is not that of {len(rows)} robots")
         return self._decide_or_fall_back(rows, given, memory)
 
     def _decide_or_fall_back(
@@ -303,6 +310,25 @@ class Monitor:
         for distance in (1.0, 0.7, 0.5, 0.3, 0.1):
             self._filter.filter(moving[None], asked, np.array([[[distance, 0.0]]]))
             self.decide(moving, [[distance, 0.0]])
+
+
+def _filter_of(bundle: Bundle, config: FilterConfig | None) -> BarrierFilter:
+    if config is not None:
+        return BarrierFilter(config)
+    try:
+        return BarrierFilter(FilterConfig(hazard_radius=bundle.manifest.hazard_radius))
+    except ValueError as error:
+        raise MonitorError(f"{bundle.path}: no filter for it: {error}") from error
+
+
+def _one_robots_hazards(hazards: ArrayLike) -> FloatArray:
+    """Hazards [1, n, 2] from [n, 2] or nothing; no other shape is guessed at."""
+    given = np.array(hazards, dtype=np.float64)
+    if given.shape == (0,):
+        return given.reshape(1, 0, 2)
+    if given.ndim != 2 or given.shape[1] != 2:
+        raise ValueError(f"hazards must have shape [n, 2], got {list(given.shape)}")
+    return given[None]
 
 
 def _check_layout(bundle: Bundle) -> None:

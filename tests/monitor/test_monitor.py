@@ -198,11 +198,38 @@ def test_an_observation_of_another_kind_ends_in_the_fallback(monitors, bad) -> N
     assert tuple(decision.action) == SAFE_ACTION
 
 
-@pytest.mark.parametrize("bad", [[[1.0]], [[1.0, 2.0, 3.0]], "near", [[np.inf, 0.0]], [[np.nan, 0.0]]])
+@pytest.mark.parametrize(
+    "bad",
+    [[[1.0]], [[1.0, 2.0, 3.0]], [1.0, 2.0], np.ones((2, 8)), 1.0, "near", [[np.inf, 0.0]], [[np.nan, 0.0]]],
+)
 def test_hazards_of_another_kind_end_in_the_fallback(monitors, at_rest, bad) -> None:
     decision = monitors["always"].decide(at_rest, bad)
     assert decision.mode == "fallback"
     assert decision.reason
+
+
+@pytest.mark.parametrize("bad", ["left", {}, FilterMemory.empty(0), FilterMemory.empty(2)])
+def test_a_memory_of_another_robot_or_kind_is_a_fault_and_not_handed_back(monitors, at_rest, bad) -> None:
+    decision = monitors["always"].decide(at_rest, memory=bad)
+    assert (decision.mode, decision.memory) == ("fallback", None)
+    assert "memory" in str(decision.reason)
+    with pytest.raises(ValueError, match="memory"):
+        monitors["always"].decide_batch(np.tile(at_rest, (3, 1)), memory=bad)
+
+
+def test_hazards_of_another_number_of_robots_are_refused(monitors, at_rest) -> None:
+    for bad in (1.0, np.ones((4, 2)), np.ones((1, 4, 2)), np.ones((2, 4, 3))):
+        with pytest.raises(ValueError, match="hazards"):
+            monitors["always"].decide_batch(np.tile(at_rest, (2, 1)), bad)
+
+
+def test_the_filter_takes_the_bundles_hazard_radius(own_bundle: Path, at_rest) -> None:
+    before = Monitor.load(own_bundle, "always").decide(at_rest, [[0.5, 0.0]]).barrier
+    bundle = Bundle.load(own_bundle)
+    wider = bundle.manifest.model_copy(update={"hazard_radius": bundle.manifest.hazard_radius + 0.1})
+    write_bundle(own_bundle, bundle.policy, bundle.multiplier, wider)
+    after = Monitor.load(own_bundle, "always").decide(at_rest, [[0.5, 0.0]]).barrier
+    assert after == pytest.approx(before - 0.1)
 
 
 def test_no_hazards_given_means_none_are_there(monitors, at_rest) -> None:
