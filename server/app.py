@@ -50,7 +50,7 @@ def create_app(
     )
 
     # The endpoint reads and writes the body itself, through pydantic's own JSON parser and serialiser: half
-    # the time # of a typed endpoint, and its errors name the field without repeating the input, which may be
+    # the time of a typed endpoint, and its errors name the field without repeating the input, which may be
     # NaN.
     @app.post(
         "/act",

@@ -38,8 +38,7 @@ class Client:
         observation_layout: what this robot sends, as `pointgoal.observation.layout(level).to_json()`;
             compared with the service's before the robot moves. None compares each observation's length alone.
         timeout: how long `act` may take, whatever the service sends meanwhile [s]. Looking up a host name is
-            not
-            included: give an address where that matters.
+            not included: give an address where that matters.
         api_key: sent as `Authorization: Bearer`.
 
     Raises:
@@ -94,7 +93,7 @@ class Client:
         started = time.perf_counter()
         try:
             body = self._body(observation, hazards)
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError) as error:
             return self._safe(f"cannot be sent: {error}", started)
         try:
             status, content = self._link.exchange("POST", "/act", body, self._timeout)
@@ -138,7 +137,7 @@ class Client:
                     f"{url}: /model answered {status}: {content[:200].decode(errors='replace')}"
                 )
             model = ModelReply.model_validate_json(content)
-        except (OSError, http.client.HTTPException) as error:
+        except (OSError, UnicodeError, http.client.HTTPException) as error:
             raise ClientError(f"{url}: {str(error) or type(error).__name__}") from error
         except ValidationError as error:
             raise ClientError(f"{url}: its /model is not that of a lagnet service") from error

@@ -86,8 +86,9 @@ class Link:
             response = http.client.HTTPResponse(opened, method=method)
             response.begin()
             content = response.read()
-        except (OSError, http.client.HTTPException):
-            # Half an exchange may be left in it: the next reply would be the answer to this request.
+        except BaseException:
+            # Half an exchange may be left in it: the next reply would be the answer to this request. Also on
+            # Ctrl-C, after which the robot may still be brought to a stop.
             self.close()
             raise
         if response.will_close:

@@ -130,8 +130,9 @@ def listen(host: str, port: int, api_key: str | None) -> socket.socket:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listener.bind(address)
         listener.listen()
-    except OSError as error:
-        raise ServeError(f"cannot listen on {host}:{port}: {error.strerror or error}") from error
+    except (OSError, UnicodeError) as error:  # UnicodeError: a host name that cannot be one
+        what = getattr(error, "strerror", None) or error
+        raise ServeError(f"cannot listen on {host}:{port}: {what}") from error
     return listener
 
 

@@ -144,7 +144,7 @@ def test_it_goes_on_after_a_fault(monitor, observation) -> None:
         assert client.act(observation).action == [0.25, 0.0]
 
 
-@pytest.mark.parametrize("bad", [[float("nan")] * 60, [float("inf")] * 60, ["x"] * 60, None])
+@pytest.mark.parametrize("bad", [[float("nan")] * 60, [float("inf")] * 60, ["x"] * 60, [10**400], None])
 def test_what_cannot_be_sent_gets_zero_thrust(monitor, bad) -> None:
     with fake_service(monitor, replies()) as url, Client(url) as client:
         reply = client.act(bad)
@@ -174,7 +174,16 @@ def test_another_observation_layout_is_refused_before_the_robot_moves(monitor) -
 
 
 @pytest.mark.parametrize(
-    "url", ["http://127.0.0.1:1", "127.0.0.1:8000", "ftp://x", "http://", "http://x:y", "http://h/p"]
+    "url",
+    [
+        "http://127.0.0.1:1",
+        "127.0.0.1:8000",
+        "ftp://x",
+        "http://",
+        "http://x:y",
+        "http://h/p",
+        f"http://{'a' * 70}",
+    ],
 )
 def test_a_service_that_is_not_there_is_an_error_at_connect(url: str) -> None:
     with pytest.raises(ClientError):

@@ -48,6 +48,7 @@ def test_what_cannot_be_served_is_one_clear_line(tiny_bundle: Path) -> None:
         ({"drain_seconds": float("nan")}, ServeError, "--drain-seconds"),
         ({"host": "::"}, ServeError, "LAGNET_API_KEY"),
         ({"host": "no such host"}, ServeError, "no such host"),
+        ({"host": "a" * 70}, ServeError, "cannot listen"),
         ({"api_key_file": Path("/none")}, ServeError, "/none"),
     ],
 )
@@ -94,7 +95,10 @@ def test_a_stop_says_not_ready_first_and_finishes_what_is_in_flight(tiny_bundle:
         link = http.client.HTTPConnection("127.0.0.1", said["port"])
         # A request of which only the head has arrived when the stop is asked for.
         body = json.dumps({"observation": observation}).encode()
-        slow = socket.create_connection(("127.0.0.1", said["port"]))
+        slow = socket.create_connection(("127.0.0.1", said["port"]), timeout=20.0)
+        # One that hangs up in the middle of its body: no reply, and no word in the log.
+        with socket.create_connection(("127.0.0.1", said["port"])) as gone:
+            gone.sendall(b"POST /act HTTP/1.1\r\nhost: x\r\ncontent-length: 100\r\n\r\n{")
         slow.sendall(f"POST /act HTTP/1.1\r\nhost: x\r\ncontent-length: {len(body)}\r\n\r\n".encode())
         link.request("GET", "/readyz")
         assert link.getresponse().read() == b'{"status":"ready"}'
