@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import signal
 import sys
 import time
@@ -14,21 +15,25 @@ from typing import Annotated
 import numpy as np
 import tyro
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from evaluation.closed_loop import Episodes, run_episodes
+from evaluation.closed_loop import SIDE_BY_SIDE, Episodes, run_episodes
 from evaluation.deciders import OverHttp
 from evaluation.pictures import Drive, animate, draw_drives, drive
+from evaluation.progress import progress_bar
 from evaluation.service import Service, ServiceError
 from evaluation.statistics import summarise
 from evaluation.tables import summary_table
 from models import Bundle, BundleError
 from monitor import Gate
 from pointgoal.observation import layout
+from pointgoal.simulation import EPISODE_STEPS
 from server import ClientError
 
 _GATES: tuple[Gate, ...] = ("off", "risk", "always")
-_EPISODE_STEPS = 1000
+
+
+class DemoError(ValueError):
+    """A demo that cannot be run as asked."""
 
 
 @dataclass(frozen=True)
@@ -49,14 +54,23 @@ class DemoConfig:
     timeout: float = 1.0
     """How long a robot waits for its action [s]."""
 
+    def check(self) -> None:
+        """Raises DemoError for settings that make no demo."""
+        if not 1 <= self.episodes <= SIDE_BY_SIDE or self.seed < 0:
+            raise DemoError(f"--episodes must be 1 to {SIDE_BY_SIDE} and --seed at least 0")
+        if not (math.isfinite(self.timeout) and self.timeout > 0.0):
+            raise DemoError(f"--timeout must be finite and positive, got {self.timeout}")
+
 
 def run_demo(config: DemoConfig, console: Console) -> None:
     """Runs the demo.
 
     Raises:
+        DemoError: for settings that make no demo.
         BundleError, ServiceError, ClientError: if a service cannot be had.
         OSError: if the folder cannot be written.
     """
+    config.check()
     started = time.monotonic()
     bundle = Bundle.load(config.bundle)
     config.out.mkdir(parents=True, exist_ok=True)
@@ -91,21 +105,14 @@ def run_demo(config: DemoConfig, console: Console) -> None:
 
 def _drive_through(gate: Gate, bundle: Bundle, config: DemoConfig, console: Console) -> Episodes:
     """The episodes under one gate, through a service of its own."""
-    bar = Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TimeRemainingColumn(),
-        console=console,
-        transient=True,
-        disable=not console.is_terminal,
-    )
+    bar = progress_bar(console)
     wanted = layout(bundle.manifest.level).to_json()
     with (
         bar,
         Service.start(config.bundle, gate) as service,
         OverHttp(service.url, wanted, config.timeout) as decider,
     ):
-        job = bar.add_task(f"gate {gate}", total=config.episodes * _EPISODE_STEPS)
+        job = bar.add_task(f"gate {gate}", total=config.episodes * EPISODE_STEPS)
         return run_episodes(
             bundle.manifest.task,
             decider,
@@ -133,7 +140,7 @@ def main() -> None:
     signal.signal(signal.SIGTERM, _interrupt)
     try:
         run_demo(config, Console())
-    except (BundleError, ServiceError, ClientError, OSError) as error:
+    except (DemoError, BundleError, ServiceError, ClientError, OSError) as error:
         Console(stderr=True).print(f"demo: {error}", style="red", markup=False, soft_wrap=True)
         sys.exit(2)
     except KeyboardInterrupt:

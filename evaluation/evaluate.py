@@ -13,19 +13,18 @@ from typing import Annotated, Any
 
 import tyro
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from evaluation.closed_loop import Episodes, HazardSource, TaskError, run_episodes
 from evaluation.deciders import Decider, InProcess, OverHttp
+from evaluation.progress import progress_bar
 from evaluation.statistics import Summary, summarise
 from evaluation.tables import summary_table
 from models import Bundle, BundleError
 from monitor import Gate, Monitor, MonitorError
 from pointgoal.observation import layout
+from pointgoal.simulation import EPISODE_STEPS
 from server import ClientError
 from server.serve import ServeError, read_api_key
-
-_EPISODE_STEPS = 1000
 
 
 class EvaluateError(ValueError):
@@ -37,15 +36,16 @@ class EvaluateConfig:
     """Runs a bundle in simulation and prints what became of the robots.
 
     Without --url the decisions are made in this process, all robots at once. With --url they are asked of a
-    running `lagnet-serve`, one connection a robot; gate and threshold are then the service's.
+    running `lagnet-serve`, one connection a robot; gate and threshold are then the service's, and one that is
+    given here must be the same.
     """
 
     bundle: Annotated[Path, tyro.conf.Positional]
     """The bundle's folder, for example models/NAME."""
     episodes: int = 100
     """How many episodes."""
-    gate: Gate = "risk"
-    """When the filter is active: where the risk score exceeds the threshold, always, never."""
+    gate: Gate | None = None
+    """When the filter is active: where the risk score exceeds the threshold (the default), always, never."""
     threshold: float | None = None
     """Risk score above which the gate `risk` activates the filter; by default the bundle's."""
     hazards: HazardSource = "given"
@@ -78,18 +78,13 @@ def evaluate(config: EvaluateConfig, console: Console) -> tuple[Summary, Episode
         raise EvaluateError("--episodes must be at least 1 and --seed at least 0")
     if not (math.isfinite(config.timeout) and config.timeout > 0.0):
         raise EvaluateError(f"--timeout must be finite and positive, got {config.timeout}")
+    if config.json is not None and not config.json.parent.is_dir():
+        raise EvaluateError(f"--json {config.json}: there is no folder {config.json.parent}")
     bundle = Bundle.load(config.bundle)
-    bar = Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TimeRemainingColumn(),
-        console=console,
-        transient=True,
-        disable=not console.is_terminal,
-    )
+    bar = progress_bar(console)
     with bar, _decider(config, bundle) as (decider, who):
         task = config.task or bundle.manifest.task
-        job = bar.add_task(task, total=config.episodes * _EPISODE_STEPS)
+        job = bar.add_task(task, total=config.episodes * EPISODE_STEPS)
 
         def advance(steps: int) -> None:
             bar.advance(job, steps)
@@ -102,7 +97,7 @@ def evaluate(config: EvaluateConfig, console: Console) -> tuple[Summary, Episode
 def _decider(config: EvaluateConfig, bundle: Bundle) -> Iterator[tuple[Decider, dict[str, Any]]]:
     """Who decides, and how it calls itself: model, gate, threshold."""
     if config.url is None:
-        monitor = Monitor.load(config.bundle, config.gate, config.threshold)
+        monitor = Monitor.load(config.bundle, config.gate or "risk", config.threshold)
         yield InProcess(monitor), {"model": bundle.id, "gate": monitor.gate, "threshold": monitor.threshold}
         return
     key = read_api_key(config.api_key_file)
@@ -110,6 +105,10 @@ def _decider(config: EvaluateConfig, bundle: Bundle) -> Iterator[tuple[Decider, 
         served = decider.connect()
         if served.model != bundle.id:
             raise EvaluateError(f"{config.url} serves {served.model}, not {bundle.id}")
+        if config.gate not in (None, served.gate):
+            raise EvaluateError(f"{config.url} has gate {served.gate}, not {config.gate}")
+        if config.threshold not in (None, served.threshold):
+            raise EvaluateError(f"{config.url} has threshold {served.threshold}, not {config.threshold}")
         yield decider, {"model": served.model, "gate": served.gate, "threshold": served.threshold}
 
 

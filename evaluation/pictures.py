@@ -23,11 +23,11 @@ from evaluation.closed_loop import Trajectory
 from evaluation.deciders import FloatArray
 from filter import Mode
 from pointgoal.observation import HAZARD_RADIUS
+from pointgoal.scene import PHYSICS_STEPS, TIMESTEP
+from pointgoal.simulation import GOAL_RADIUS
 
-STEP_SECONDS = 0.02
+STEP_SECONDS = TIMESTEP * PHYSICS_STEPS
 """Duration of one step [s]."""
-GOAL_RADIUS = 0.3
-"""The goal is met within this distance [m]."""
 
 _INK, _GREY, _PAPER, _PANEL = "#1b263b", "#8d99ae", "#ffffff", "#f7f8fa"
 _HAZARD, _HAZARD_EDGE = "#f6bdc0", "#d62839"

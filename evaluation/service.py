@@ -14,6 +14,7 @@ from types import TracebackType
 from typing import Self
 
 from monitor import Gate
+from server.serve import KEY_VARIABLE
 
 _START_SECONDS = 60.0
 _STOP_SECONDS = 10.0
@@ -54,6 +55,8 @@ class Service:
         Raises:
             ServiceError: if it ends or does not listen within a minute.
         """
+        # It is ours alone and asks for no key, unless the command names one.
+        environment = {name: value for name, value in os.environ.items() if name != KEY_VARIABLE}
         # A session of its own: Ctrl-C in the terminal reaches us alone, and we stop the service in order.
         process = subprocess.Popen(
             command,
@@ -61,7 +64,7 @@ class Service:
             stderr=subprocess.PIPE,
             text=True,
             start_new_session=True,
-            env=os.environ | {"OMP_NUM_THREADS": "1"},
+            env=environment | {"OMP_NUM_THREADS": "1"},
         )
         try:
             return Service(process, _read_url(process))

@@ -61,6 +61,25 @@ def test_evaluate_says_in_one_line_what_is_wrong(tiny_bundle: Path) -> None:
     assert "http://127.0.0.1:1" in line
 
 
+def test_a_gate_that_is_not_the_services_is_refused(tiny_bundle: Path, monkeypatch) -> None:
+    # A key of the user's own services is none of this one's.
+    monkeypatch.setenv("LAGNET_API_KEY", "sesame")
+    with Service.start(tiny_bundle, "off") as service:
+        asked = ("evaluation.evaluate", tiny_bundle, "--url", service.url)
+        for given, named in ((("--gate", "always"), "gate off"), (("--threshold", "0.1"), "threshold 0.5")):
+            result = command(*asked, *given)
+            assert result.returncode == 2
+            assert named in result.stderr
+
+
+@pytest.mark.parametrize("wrong", [("--episodes", 0), ("--seed", -1), ("--timeout", "nan")])
+def test_a_demo_that_cannot_be_run_is_one_line(tiny_bundle: Path, tmp_path: Path, wrong) -> None:
+    result = command("evaluation.demo", tiny_bundle, "--out", tmp_path, *wrong)
+    assert result.returncode == 2
+    (line,) = result.stderr.strip().splitlines()
+    assert wrong[0] in line
+
+
 def test_the_demo_leaves_a_table_a_picture_and_an_animation(tiny_bundle: Path, tmp_path: Path) -> None:
     out = tmp_path / "demo"
     result = command("evaluation.demo", tiny_bundle, "--out", out, "--episodes", 1)
