@@ -28,12 +28,12 @@ class Decision:
         threshold: the gate `risk` activates the filter where risk is above this.
         mode: "nominal" only if `action` is `nominal_action` bit for bit; "filtered" if the filter changed it;
             "fallback" if a backup manoeuvre or, on a fault, the safe action is sent.
-        barrier: h [m], ≥ 0 is safe; NaN if it could not be computed, +Inf without any hazard in sight.
+        barrier: h [m], ≥ 0 is safe, at most the lidar's range; NaN if it could not be computed.
         hazard: index of the hazard that caused the intervention, or None.
         row: label of the QP's row that caused it, or None.
         reason: why the mode is "fallback", or None.
         gate_open: whether the filter was active.
-        memory: what to pass to the next call for this robot, or None after a fault.
+        memory: what to pass to the next call for this robot; None if there was none or it was no memory.
     """
 
     action: FloatArray

@@ -46,7 +46,7 @@ class ActReply(BaseModel):
         risk: the risk score λ_ξ(s); null if the multiplier network gave no number.
         threshold: the gate `risk` activates the filter where risk is above this.
         mode: nominal, filtered or fallback.
-        barrier: h [m], ≥ 0 is safe; null if there is no hazard in sight or it could not be computed.
+        barrier: h [m], ≥ 0 is safe, at most the lidar's range; null if it could not be computed.
         hazard: index of the hazard that caused the intervention.
         row: label of the QP's row that caused it.
         reason: why the mode is fallback.
