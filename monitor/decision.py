@@ -33,7 +33,7 @@ class Decision:
         row: label of the QP's row that caused it, or None.
         reason: why the mode is "fallback", or None.
         gate_open: whether the filter was active.
-        memory: what to pass to the next call for this robot; None if there was none or it was no memory.
+        memory: what to pass to the next call for this robot; empty after a fault.
     """
 
     action: FloatArray

@@ -154,9 +154,9 @@ class Monitor:
             row = np.array(observation, dtype=np.float64)[None]
             given = None if hazards is None else _one_robots_hazards(hazards)
         except _FAULTS as error:
-            return self._fallback(1, f"bad input: {error}", memory)[0]
+            return self._fallback(1, f"bad input: {error}")[0]
         if memory is not None and not fits(memory, 1):
-            return self._fallback(1, "bad input: the memory is not that of one robot", None)[0]
+            return self._fallback(1, "bad input: the memory is not that of one robot")[0]
         return self._decide_or_fall_back(row, given, memory)[0]
 
     def decide_batch(
@@ -195,7 +195,7 @@ class Monitor:
             return self._decide(observation, hazards, memory)
         except _FAULTS as error:
             if len(observation) <= 1:
-                return self._fallback(len(observation), str(error) or type(error).__name__, memory)
+                return self._fallback(len(observation), str(error) or type(error).__name__)
         # Something in one row spoils the batch: decide one by one, so that only its own robot gets the
         # fallback.
         return _stack(
@@ -275,8 +275,11 @@ class Monitor:
         if (changed & ~active).any():
             raise ValueError("the filter changed an action though its gate is closed")
 
-    def _fallback(self, count: int, reason: str, memory: FilterMemory | None) -> DecisionBatch:
-        """Zero thrust for all: no barrier falls while the robot coasts."""
+    def _fallback(self, count: int, reason: str) -> DecisionBatch:
+        """Zero thrust for all: no barrier falls while the robot coasts.
+
+        The memory starts anew: what it planned was for another action than this one.
+        """
         return DecisionBatch(
             action=np.tile(self._safe, (count, 1)),
             nominal_action=np.full((count, 2), np.nan),
@@ -288,7 +291,7 @@ class Monitor:
             row=[None] * count,
             reason=[reason] * count,
             gate_open=np.ones(count, np.bool_),
-            memory=memory,
+            memory=FilterMemory.empty(count),
         )
 
     def _warm_up(self) -> None:

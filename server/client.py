@@ -157,7 +157,9 @@ class Client:
         return to_json(body)
 
     def _safe(self, reason: str, started: float) -> ActReply:
-        return ActReply.safe(reason, time.perf_counter() - started, self._memory)
+        # What the filter planned was for another action than the one that the robot now takes.
+        self._memory = None
+        return ActReply.safe(reason, time.perf_counter() - started)
 
 
 def _numbers(name: str, values: ArrayLike) -> list[Any]:

@@ -92,7 +92,7 @@ class ActReply(BaseModel):
         )
 
     @classmethod
-    def safe(cls, reason: str, seconds: float, memory: MemoryJson | None) -> Self:
+    def safe(cls, reason: str, seconds: float) -> Self:
         """The reply that the client makes itself when it got none: zero thrust."""
         return cls(
             action=list(SAFE_ACTION),
@@ -107,7 +107,7 @@ class ActReply(BaseModel):
             gate_open=True,
             model=None,
             seconds=seconds,
-            memory=memory,
+            memory=None,
         )
 
 

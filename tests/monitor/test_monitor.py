@@ -211,7 +211,9 @@ def test_hazards_of_another_kind_end_in_the_fallback(monitors, at_rest, bad) -> 
 @pytest.mark.parametrize("bad", ["left", {}, FilterMemory.empty(0), FilterMemory.empty(2)])
 def test_a_memory_of_another_robot_or_kind_is_a_fault_and_not_handed_back(monitors, at_rest, bad) -> None:
     decision = monitors["always"].decide(at_rest, memory=bad)
-    assert (decision.mode, decision.memory) == ("fallback", None)
+    assert decision.mode == "fallback"
+    assert decision.memory is not None
+    assert decision.memory.side.tolist() == [0]
     assert "memory" in str(decision.reason)
     with pytest.raises(ValueError, match="memory"):
         monitors["always"].decide_batch(np.tile(at_rest, (3, 1)), memory=bad)
@@ -230,6 +232,15 @@ def test_the_filter_takes_the_bundles_hazard_radius(own_bundle: Path, at_rest) -
     write_bundle(own_bundle, bundle.policy, bundle.multiplier, wider)
     after = Monitor.load(own_bundle, "always").decide(at_rest, [[0.5, 0.0]]).barrier
     assert after == pytest.approx(before - 0.1)
+
+
+def test_a_fault_forgets_what_the_filter_planned(monitors, at_rest) -> None:
+    memory = FilterMemory.empty(1)
+    memory.side[:] = 1
+    at_rest[0] = np.nan
+    after = monitors["always"].decide(at_rest, memory=memory).memory
+    assert after is not None
+    assert after.side.tolist() == [0]
 
 
 def test_no_hazards_given_means_none_are_there(monitors, at_rest) -> None:

@@ -127,6 +127,26 @@ def test_a_service_that_misbehaves_gets_zero_thrust_in_time(monitor, observation
         assert reply.model is None
 
 
+def test_a_fault_forgets_the_filters_memory(monitor, observation) -> None:
+    seen: list[bool] = []
+    answers = iter([replies(memory={"side": [1]}), replies(action=["1", "2"]), replies()])
+
+    def in_turn(connection: socket.socket) -> None:
+        next(answers)(connection)
+
+    with fake_service(monitor, in_turn) as url, Client(url) as client:
+        exchange = client._link.exchange
+
+        def watched(method: str, path: str, body: bytes, timeout: float) -> tuple[int, bytes]:
+            seen.append(b"memory" in body)
+            return exchange(method, path, body, timeout)
+
+        client._link.exchange = watched
+        modes = [client.act(observation).mode for _ in range(3)]
+    assert modes == ["nominal", "fallback", "nominal"]
+    assert seen == [False, True, False]
+
+
 def test_it_goes_on_after_a_fault(monitor, observation) -> None:
     answers = iter([silence, replies(), hang_up, replies(action=[0.25, 0.0])])
 
