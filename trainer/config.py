@@ -36,24 +36,28 @@ class Config:
     resume: Path | None = None
     """Continue the run in this folder from its last checkpoint; takes no other flag."""
 
-    num_envs: int = 40
+    num_envs: int = 80
     """Environments stepped side by side."""
+    action_repeat: int = 5
+    """Control steps that a decision is held for during training; the exported policy decides every step."""
     epoch_steps: int = 20_000
-    """Environment steps between two updates, over all environments; a multiple of num_envs."""
+    """Control steps between two updates, over all environments; a multiple of num_envs · action_repeat."""
     episode_steps: int = 1000
     """Steps of a full episode [steps]; turns the cost limit into the state-wise limit."""
     threads: int = 2
     """Threads for physics, and for the update (one for the policy, one for the critics)."""
 
     discount: float = 0.99
-    """Discount γ of the reward and of the cost."""
-    gae: float = 0.95
-    """λ of generalised advantage estimation, for the reward and the cost."""
-    passes: int = 5
+    """Discount γ of the reward, a control step."""
+    cost_discount: float = 0.99
+    """Discount γ of the cost, a control step."""
+    gae: float = 0.9
+    """λ of generalised advantage estimation, for the reward and the cost, a decision."""
+    passes: int = 10
     """Passes over an epoch's data in one update, at most."""
-    minibatch: int = 2000
+    minibatch: int = 500
     """Samples in one minibatch."""
-    learning_rate: float = 3e-4
+    learning_rate: float = 5e-4
     """Adam's step size for the actor; decays linearly to zero over the run."""
     critic_learning_rate: float = 1e-3
     """Adam's step size for the critics."""
@@ -67,6 +71,14 @@ class Config:
     """Largest norm of a gradient, for the actor, the critics and the multiplier network each."""
     critic_l2: float = 0.0
     """Weight of Σ p² over the critics' parameters in their loss (OmniSafe's is 0.001)."""
+    nearness: float = 0.25
+    """Distance [m] over which the networks' nearness of a hazard, a feature of each bin of the hazards'
+    lidar beside its reading, falls by a factor e; 0 leaves these features out."""
+    action_range: tuple[float, ...] | None = None
+    """Largest size of each action that the policy uses, which is also its unit. Not set: 0.05 for the point
+    robot's thrust, which saturates there, and 1 for its turning; the task's bounds elsewhere."""
+    saturation: float = 0.05
+    """Weight of the squared excess of the policy's mean over the action range, which keeps it exploring."""
     initial_log_std: float = -0.5
     """Initial log standard deviation of the policy's actions."""
 
@@ -138,8 +150,17 @@ class Config:
 
     @property
     def horizon(self) -> int:
-        """Steps of each environment in one epoch (T)."""
-        return self.epoch_steps // self.num_envs
+        """Decisions of each environment in one epoch (T)."""
+        return self.epoch_steps // (self.num_envs * self.action_repeat)
+
+    @property
+    def episode_decisions(self) -> int:
+        """Decisions of a full episode (H)."""
+        return self.episode_steps // self.action_repeat
+
+    def per_decision(self, discount: float) -> float:
+        """A discount for a decision from one for a control step."""
+        return float(discount**self.action_repeat)
 
     @property
     def epochs(self) -> int:
@@ -148,17 +169,18 @@ class Config:
 
 
 _POSITIVE = (
-    "total_steps", "num_envs", "epoch_steps", "episode_steps", "threads", "passes", "minibatch",
+    "total_steps", "num_envs", "action_repeat", "epoch_steps", "episode_steps", "threads", "passes",
+    "minibatch",
     "learning_rate", "critic_learning_rate", "clip", "kl_stop", "gradient_clip",
     "multiplier_learning_rate", "multiplier_passes", "checkpoint_every", "foresight_init",
     "foresight_learning_rate", "scale_init", "scale_step", "limit_share", "dual_learning_rate", "pid_delay",
     "ipo_sharpness", "ipo_kappa", "trust_kl", "cg_iterations", "fisher_every",
 )  # fmt: skip
 _NOT_NEGATIVE = (
-    "cost_limit", "seed", "entropy", "critic_l2", "multiplier_init", "scale_gain", "dual_init", "pid_kp",
-    "pid_ki", "pid_kd", "damping",
+    "cost_limit", "seed", "entropy", "nearness", "saturation", "critic_l2", "multiplier_init", "scale_gain",
+    "dual_init", "pid_kp", "pid_ki", "pid_kd", "damping",
 )  # fmt: skip
-_FRACTION = ("discount", "gae", "foresight", "pid_smoothing")
+_FRACTION = ("discount", "cost_discount", "gae", "foresight", "pid_smoothing")
 
 
 def check(config: Config) -> None:
@@ -183,9 +205,20 @@ def check(config: Config) -> None:
     for name in _FRACTION:
         if not 0 <= values[name] <= 1:
             raise ConfigError(f"{_flag(name)} must lie between 0 and 1, not {values[name]}")
-    if config.epoch_steps % config.num_envs:
+    _check_multiples(config)
+
+
+def _check_multiples(config: Config) -> None:
+    decisions = config.num_envs * config.action_repeat
+    if config.epoch_steps % decisions:
         raise ConfigError(
-            f"--epoch-steps ({config.epoch_steps}) must be a multiple of --num-envs ({config.num_envs})"
+            f"--epoch-steps ({config.epoch_steps}) must be a multiple of "
+            f"--num-envs × --action-repeat ({decisions})"
+        )
+    if config.episode_steps % config.action_repeat:
+        raise ConfigError(
+            f"--episode-steps ({config.episode_steps}) must be a multiple of "
+            f"--action-repeat ({config.action_repeat})"
         )
 
 

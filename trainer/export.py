@@ -20,6 +20,7 @@ from rich.console import Console
 from models import BundleError, Manifest, ObservationBlock, write_bundle
 from pointgoal.observation import HAZARD_RADIUS, layout
 from trainer import checkpoint, onnx_graph
+from trainer.actions import ActionRange
 from trainer.algorithms import ALGORITHMS
 from trainer.algorithms.base import Algorithm
 from trainer.calibration import Threshold, calibrate
@@ -78,22 +79,20 @@ class TrainedRun:
         try:
             inputs = state["normaliser.mean"].shape[0]
             rng = np.random.default_rng(0)
-            self.learner = Learner(self.config, inputs, len(facts["action_low"]), rng)
+            self.range = ActionRange(**{k: np.asarray(v, np.float32) for k, v in facts["actions"].items()})
+            self.learner = Learner(self.config, inputs, self.range, rng)
             self.algorithm: Algorithm = ALGORITHMS[self.config.algorithm](self.learner)
             self.learner.load_state_dict(state)
             self.algorithm.load_state(facts["algorithm"])
             self.steps = int(facts["epoch"]) * self.config.epoch_steps
-            self.low = np.asarray(facts["action_low"], np.float32)
-            self.high = np.asarray(facts["action_high"], np.float32)
-        except (KeyError, ValueError, IndexError) as error:
+        except (KeyError, ValueError, IndexError, TypeError) as error:
             raise CheckpointError(f"the checkpoint in {folder} does not fit its settings: {error}") from error
 
     def actions(self, observation: Floats) -> Floats:
         """The mean action [B, a] within bounds for raw observations [B, n], by torch."""
         with torch.no_grad():
-            mean, _ = self.learner.policy(self._normalised(observation))
-        action: Floats = np.clip(mean.numpy(), self.low, self.high)
-        return action
+            mean, _ = self.learner.policy(self._inputs(observation))
+        return self.range.sent(mean.numpy())
 
     def multipliers(self, observation: Floats) -> Floats:
         """λ [B] of raw observations [B, n], by torch; a constant without a multiplier network."""
@@ -101,10 +100,10 @@ class TrainedRun:
         if network is None:
             return np.full(observation.shape[0], NO_NETWORK, np.float32)
         with torch.no_grad():
-            return np.asarray(network(self._normalised(observation)).numpy())
+            return np.asarray(network(self._inputs(observation)).numpy())
 
-    def _normalised(self, observation: Floats) -> torch.Tensor:
-        return torch.from_numpy(self.learner.normaliser(observation))
+    def _inputs(self, observation: Floats) -> torch.Tensor:
+        return torch.from_numpy(self.learner.features(observation))
 
     def policy(self) -> "Inference":
         """The policy's mean for few observations at a time."""
@@ -113,15 +112,14 @@ class TrainedRun:
     def graphs(self) -> tuple[bytes, bytes]:
         """policy.onnx and multiplier.onnx."""
         learner = self.learner
-        mean, inverse = learner.normaliser.scale()
-        shape = learner.actor_shape
+        features, shape = learner.features, learner.actor_shape
         actor = learner.actor.detach().numpy()[: shape.size]
-        policy = onnx_graph.policy_graph(actor, shape, mean, inverse, self.low, self.high)
+        policy = onnx_graph.policy_graph(actor, shape, features, self.range)
         network = self.algorithm.multiplier_network()
         if network is None:
-            return policy, onnx_graph.constant_graph(shape.inputs, NO_NETWORK)
+            return policy, onnx_graph.constant_graph(len(features.normaliser.mean), NO_NETWORK)
         xi = network.parameters.detach().numpy()
-        multiplier = onnx_graph.multiplier_graph(xi, learner.critic_shape, mean, inverse, network.scale)
+        multiplier = onnx_graph.multiplier_graph(xi, learner.critic_shape, features, network.scale)
         return policy, multiplier
 
 
@@ -158,8 +156,8 @@ def export(config: ExportConfig) -> Manifest:
         algorithm=run.config.algorithm,
         observation_layout=tuple(ObservationBlock(**block) for block in layout(level).to_json()),
         observation_size=layout(level).size,
-        action_low=(float(run.low[0]), float(run.low[1])),
-        action_high=(float(run.high[0]), float(run.high[1])),
+        action_low=(float(run.range.low[0]), float(run.range.low[1])),
+        action_high=(float(run.range.high[0]), float(run.range.high[1])),
         threshold=threshold.value,
         threshold_source=threshold.source,
         hazard_radius=HAZARD_RADIUS,
@@ -174,13 +172,12 @@ def export(config: ExportConfig) -> Manifest:
 def play(run: TrainedRun, count: int, threads: int) -> Episodes:
     """Deterministic closed-loop episodes of a run's policy on layouts that training never saw."""
     act = run.policy()
-    mean_inverse = run.learner.normaliser.scale()
-    low, high = run.low, run.high
+    features = run.learner.features
     settings = dataclasses.replace(run.config, num_envs=min(count, ENVIRONMENTS), threads=threads)
     with closing(make_environments(settings)) as env:
         return episodes(
             env,
-            lambda observation: np.clip(act(observation, *mean_inverse), low, high),
+            lambda observation: run.range.sent(act(features(observation))),
             count,
             run.config.episode_steps,
             SEED + run.config.seed,
@@ -224,10 +221,11 @@ def _level(run: TrainedRun) -> int:
     if match is None:
         raise ExportError(f"a bundle is for a PointGoal task, not {run.config.task}")
     level = int(match[1])
-    if run.learner.actor_shape.inputs != layout(level).size:
+    size = len(run.learner.features.normaliser.mean)
+    if size != layout(level).size:
         raise ExportError(
             f"{run.config.algorithm} observes more than the robot's sensors give "
-            f"({run.learner.actor_shape.inputs} numbers, not {layout(level).size}): it cannot be exported"
+            f"({size} numbers, not {layout(level).size}): it cannot be exported"
         )
     return level
 

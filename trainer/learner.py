@@ -10,11 +10,12 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from trainer.actions import ActionRange
 from trainer.advantage import gae, successor_values
 from trainer.config import Config
 from trainer.errors import CheckpointError, NonFiniteError
+from trainer.features import Features, nearness
 from trainer.networks import Shape, fast_mlp, gaussian, initial, log_probability
-from trainer.normaliser import Normaliser
 from trainer.rollout import Trajectory
 
 ADAM = ("step", "exp_avg", "exp_avg_sq")
@@ -28,7 +29,7 @@ class Batch:
     """One epoch as samples in random order, B = T · N.
 
     Attributes:
-        observation: normalised [B, n].
+        observation: the networks' inputs [B, m].
         action: [B, a].
         mean: the acting policy's mean action [B, a].
         log_std: its log standard deviation [a].
@@ -36,7 +37,7 @@ class Batch:
         reward_advantage: A, mean 0 and deviation 1 [B].
         cost_advantage: A_c, mean 0, its own scale kept [B].
         targets: of the reward critic and the cost critic [2, B].
-        cost: C(s, a, s') [B].
+        cost: C(s, a, s'), a control step's mean over the decision [B].
         order: where each sample stands in the trajectory's row-major order [B].
         trajectory: what the samples come from.
         schedule: for each pass, the minibatches in the order they are taken, each a slice of the samples.
@@ -57,22 +58,26 @@ class Batch:
 
 
 class Learner:
-    """Actor, both critics and the observation normaliser, with their optimisers.
+    """Actor, both critics and their features, with their optimisers.
 
     Attributes:
         actor: parameters of the Gaussian policy [P + a].
         critics: parameters of the reward and the cost critic [2, P'].
         actor_shape: layer sizes of the actor's network.
         critic_shape: layer sizes of the critics, and of a multiplier network.
+        edge: where the policy's draws saturate [a].
     """
 
-    def __init__(self, config: Config, observations: int, actions: int, rng: np.random.Generator) -> None:
+    def __init__(
+        self, config: Config, observations: int, actions: ActionRange, rng: np.random.Generator
+    ) -> None:
         self.config = config
+        self.edge = torch.from_numpy(actions.edge)
         self.rng = rng
-        self.normaliser = Normaliser(observations)
-        self.actor_shape = Shape(observations, actions)
-        self.critic_shape = Shape(observations, 1)
-        log_std = torch.full((actions,), config.initial_log_std)
+        self.features = Features(observations, nearness(config))
+        self.actor_shape = Shape(self.features.size, len(actions.unit))
+        self.critic_shape = Shape(self.features.size, 1)
+        log_std = torch.full((len(actions.unit),), config.initial_log_std)
         actor = torch.cat([initial(self.actor_shape, rng, 0.01), log_std])
         critics = torch.stack([initial(self.critic_shape, rng, 0.1) for _ in (REWARD, COST)])
         self.parameters: dict[str, Tensor] = {}
@@ -101,11 +106,11 @@ class Learner:
         self.optimisers["actor"].param_groups[0]["lr"] = self.config.learning_rate * (1 - progress)
 
     def policy(self, observation: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean [B, a] and log standard deviation [a] for normalised observations [B, n]."""
+        """Mean [B, a] and log standard deviation [a] for the networks' inputs [B, m]."""
         return gaussian(self.actor, observation, self.actor_shape)
 
     def values(self, observation: Tensor) -> Tensor:
-        """Reward and cost values [2, B] of normalised observations [B, n]."""
+        """Reward and cost values [2, B] for the networks' inputs [B, m]."""
         return torch.stack([fast_mlp(row, observation, self.critic_shape)[:, 0] for row in self.critics])
 
     def batch(self, trajectory: Trajectory, cost_discount: float, cost_outlives_episode: bool) -> Batch:
@@ -113,7 +118,7 @@ class Learner:
 
         Args:
             trajectory: one epoch.
-            cost_discount: γ of the cost.
+            cost_discount: γ of the cost, a decision.
             cost_outlives_episode: whether a time limit leaves the cost's value at the final observation; the
                 reward's it always does.
 
@@ -129,15 +134,15 @@ class Learner:
         T, N = trajectory.reward.shape
         config = self.config
         with torch.no_grad():
-            seen = self.normalised(trajectory.observation)
+            seen = self.inputs(trajectory.observation)
             values = self.values(seen).view(2, T + 1, N).numpy()
-            final_values = self.values(self.normalised(trajectory.final_observation)).numpy()
+            final_values = self.values(self.inputs(trajectory.final_observation)).numpy()
         order = self.rng.permutation(T * N)
         rows = torch.from_numpy(order)
         advantages, targets = [], []
         ended, terminated = trajectory.ended, trajectory.terminated
         for k, signal, discount, over in (
-            (REWARD, trajectory.reward, config.discount, terminated),
+            (REWARD, trajectory.reward, config.per_decision(config.discount), terminated),
             (COST, trajectory.cost, cost_discount, terminated if cost_outlives_episode else ended),
         ):
             after = successor_values(values[k], ended, over, final_values[k])
@@ -156,7 +161,7 @@ class Learner:
             reward_advantage=(reward_advantage - reward_advantage.mean()) / (reward_advantage.std() + 1e-8),
             cost_advantage=cost_advantage - cost_advantage.mean(),
             targets=torch.stack(targets),
-            cost=torch.from_numpy(trajectory.cost.reshape(-1)[order]),
+            cost=torch.from_numpy(trajectory.cost.reshape(-1)[order] / np.float32(config.action_repeat)),
             order=order,
             trajectory=trajectory,
             schedule=self._schedule(T * N),
@@ -185,16 +190,16 @@ class Learner:
         pending = self._pool.submit(second)
         return first() | pending.result()
 
-    def normalised(self, observation: npt.NDArray[np.float32]) -> Tensor:
-        """Raw observations [..., n] → normalised tensor [B, n]."""
-        return _flat(self.normaliser(observation))
+    def inputs(self, observation: npt.NDArray[np.float32]) -> Tensor:
+        """Raw observations [..., n] → the networks' inputs [B, m]."""
+        return _flat(self.features(observation))
 
     def state_dict(self) -> dict[str, npt.NDArray[Any]]:
         """Arrays from which load_state_dict goes on bit for bit."""
         state: dict[str, npt.NDArray[Any]] = {
-            "normaliser.mean": self.normaliser.mean,
-            "normaliser.variance": self.normaliser.variance,
-            "normaliser.count": np.asarray(self.normaliser.count),
+            "normaliser.mean": self.features.normaliser.mean,
+            "normaliser.variance": self.features.normaliser.variance,
+            "normaliser.count": np.asarray(self.features.normaliser.count),
         }
         for name, parameters in self.parameters.items():
             state[name] = parameters.detach().numpy()
@@ -223,9 +228,9 @@ class Learner:
                 self.optimisers[name].state[parameters] = {
                     key: torch.from_numpy(state[f"adam.{name}.{key}"].copy()) for key in ADAM
                 }
-        self.normaliser.mean = state["normaliser.mean"].copy()
-        self.normaliser.variance = state["normaliser.variance"].copy()
-        self.normaliser.count = float(state["normaliser.count"])
+        self.features.normaliser.mean = state["normaliser.mean"].copy()
+        self.features.normaliser.variance = state["normaliser.variance"].copy()
+        self.features.normaliser.count = float(state["normaliser.count"])
 
 
 def _flat(array: npt.NDArray[np.float32]) -> Tensor:

@@ -61,3 +61,16 @@ def multiplier_loss(multiplier: Tensor, cost: Tensor, state_limit: float) -> Ten
         Scalar to minimise.
     """
     return -(multiplier * (cost - state_limit)).mean()
+
+
+def saturation_loss(mean: Tensor, edge: Tensor) -> Tensor:
+    """E[Σ max(0, |μ| − edge)²]: how far the policy's mean lies where actions no longer differ.
+
+    Args:
+        mean: μ(s) [B, a].
+        edge: [a].
+
+    Returns:
+        Scalar to minimise.
+    """
+    return (mean.abs() - edge).clamp(min=0).square().sum(1).mean()

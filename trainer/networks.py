@@ -125,7 +125,7 @@ def gaussian(theta: Tensor, x: Tensor, shape: Shape) -> tuple[Tensor, Tensor]:
 
     Args:
         theta: parameters [P + a]: the network's, then the log standard deviations.
-        x: normalised observations [B, n].
+        x: inputs [B, n].
         shape: the network's layer sizes; a = shape.outputs.
 
     Returns:

@@ -9,6 +9,8 @@ import numpy.typing as npt
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
+from trainer.actions import ActionRange
+from trainer.features import GAIN, Features
 from trainer.networks import HIDDEN, Shape
 from trainer.normaliser import CLIP
 
@@ -18,7 +20,7 @@ Floats = npt.NDArray[np.float32]
 
 
 class _Builder:
-    """Collects nodes and constants of a graph that is a chain of tensors."""
+    """Collects nodes and constants of a graph; a node takes the last one's output."""
 
     def __init__(self) -> None:
         self.nodes: list[onnx.NodeProto] = []
@@ -35,11 +37,29 @@ class _Builder:
         self.nodes.append(helper.make_node(operator, [self.last, *others], [result]))
         self.last = result
 
-    def network(self, theta: Floats, shape: Shape, mean: Floats, inverse: Floats) -> None:
-        """Normalises the observation and runs a network on it."""
+    def features(self, features: Features) -> None:
+        """The networks' inputs, see features.Features."""
+        mean, inverse = features.normaliser.scale()
+        near = features.nearness
+        others: list[str] = []
+        if near is not None:
+            self.node("Slice", *(self.constant([k], np.int64) for k in (near.start, near.stop, 1)))
+            self.node("Sub", self.constant(1.0))
+            self.node("Mul", self.constant(near.rate))
+            self.node("Exp")
+            self.node("Mul", self.constant(GAIN))
+            others = [self.last]
+            self.last = "observation"
         self.node("Sub", self.constant(mean))
         self.node("Mul", self.constant(inverse))
         self.node("Clip", self.constant(-CLIP), self.constant(CLIP))
+        if others:
+            self.node("Concat", *others)
+            self.nodes[-1].attribute.append(helper.make_attribute("axis", 1))
+
+    def network(self, theta: Floats, shape: Shape, features: Features) -> None:
+        """Runs a network on the observation's features."""
+        self.features(features)
         w1, b1, w2, b2, w3, b3 = np.split(theta, np.cumsum(shape.splits)[:-1])
         layers = (w1.reshape(-1, HIDDEN), b1), (w2.reshape(HIDDEN, HIDDEN), b2), (w3.reshape(HIDDEN, -1), b3)
         for k, (weight, bias) in enumerate(layers):
@@ -65,48 +85,44 @@ class _Builder:
         return bytes(model.SerializeToString())
 
 
-def policy_graph(
-    theta: Floats, shape: Shape, mean: Floats, inverse: Floats, low: Floats, high: Floats
-) -> bytes:
-    """Observation [batch, n] → action [batch, a]: the mean action, clipped to the bounds.
+def policy_graph(theta: Floats, shape: Shape, features: Features, actions: ActionRange) -> bytes:
+    """Observation [batch, n] → action [batch, a]: the policy's mean, as it is sent to the robot.
 
     Args:
         theta: the actor network's parameters [P].
         shape: its layer sizes.
-        mean: of the observations [n].
-        inverse: 1 / their standard deviation [n].
-        low: lower bounds of the action [a].
-        high: upper bounds of the action [a].
+        features: what it sees.
+        actions: unit and bounds of the actions.
 
     Returns:
         The file's bytes.
     """
     builder = _Builder()
-    builder.network(theta, shape, mean, inverse)
-    builder.node("Max", builder.constant(low))
-    builder.node("Min", builder.constant(high), output="action")
-    return builder.model(shape.inputs, "action", ["batch", shape.outputs])
+    builder.network(theta, shape, features)
+    builder.node("Mul", builder.constant(actions.unit))
+    builder.node("Max", builder.constant(actions.low))
+    builder.node("Min", builder.constant(actions.high), output="action")
+    return builder.model(len(features.normaliser.mean), "action", ["batch", shape.outputs])
 
 
-def multiplier_graph(theta: Floats, shape: Shape, mean: Floats, inverse: Floats, scale: float) -> bytes:
+def multiplier_graph(theta: Floats, shape: Shape, features: Features, scale: float) -> bytes:
     """Observation [batch, n] → multiplier [batch]: scale · softplus(f_ξ(s)).
 
     Args:
         theta: the multiplier network's parameters [P].
         shape: its layer sizes.
-        mean: of the observations [n].
-        inverse: 1 / their standard deviation [n].
+        features: what it sees.
         scale: what the softplus is multiplied by.
 
     Returns:
         The file's bytes.
     """
     builder = _Builder()
-    builder.network(theta, shape, mean, inverse)
+    builder.network(theta, shape, features)
     builder.node("Softplus")
     builder.node("Mul", builder.constant(scale))
     builder.node("Squeeze", builder.constant([1], np.int64), output="multiplier")
-    return builder.model(shape.inputs, "multiplier", ["batch"])
+    return builder.model(len(features.normaliser.mean), "multiplier", ["batch"])
 
 
 def constant_graph(inputs: int, value: float) -> bytes:

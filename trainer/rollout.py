@@ -9,8 +9,10 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.vector import VectorEnv
 
+from trainer.actions import ActionRange
+from trainer.config import Config
+from trainer.features import Features
 from trainer.networks import HIDDEN, Shape
-from trainer.normaliser import Normaliser
 from trainer.report import TAIL
 
 Floats = npt.NDArray[np.float32]
@@ -20,12 +22,12 @@ RECENT = 100
 
 @dataclass
 class Trajectory:
-    """One epoch of experience: T steps of N environments.
+    """One epoch of experience: T decisions of N environments.
 
     Attributes:
         observation: raw observations, the one after the last step included [T + 1, N, n].
-        action: sampled actions, before they are clipped to the bounds [T, N, a].
-        mean: the policy's mean action [T, N, a].
+        action: the policy's draws, before they are scaled and clipped [T, N, a].
+        mean: their mean [T, N, a].
         reward: [T, N].
         cost: the cost that is constrained [T, N].
         ended: whether an episode ended with the step [T, N].
@@ -54,7 +56,7 @@ class Figures:
         lengths: steps of each of them.
         total: episodes ended since the run began.
         fresh: how many of them ended in the latest epoch.
-        step_cost: mean cost of a step in the latest epoch.
+        step_cost: mean cost of a control step in the latest epoch.
     """
 
     returns: deque[float] = field(default_factory=lambda: deque(maxlen=TAIL))
@@ -86,20 +88,19 @@ class Rollout:
     def __init__(
         self,
         env: VectorEnv[Any, Any, Any],
-        horizon: int,
-        episode_steps: int,
-        seed: int,
+        config: Config,
         noise: np.random.Generator,
+        actions: ActionRange,
     ) -> None:
         self.env = env
-        self.horizon = horizon
+        self.config = config
         self.noise = noise
         self.figures = Figures()
         self.seconds = {"simulation": 0.0, "inference": 0.0}
-        space = env.single_action_space
-        self._low, self._high = np.asarray(space.low), np.asarray(space.high)  # type: ignore[attr-defined]
-        elapsed = np.arange(env.num_envs) * episode_steps // env.num_envs
-        observation, _ = env.reset(seed=seed, options={"elapsed_steps": elapsed})
+        self.actions = actions
+        elapsed = np.arange(env.num_envs) * config.episode_steps // env.num_envs
+        elapsed -= elapsed % config.action_repeat
+        observation, _ = env.reset(seed=config.seed, options={"elapsed_steps": elapsed})
         self._observation = np.asarray(observation, np.float32)
         self._return = np.zeros(env.num_envs)
         self._cost = np.zeros(env.num_envs)
@@ -107,29 +108,29 @@ class Rollout:
         self._length = np.zeros(env.num_envs)
         self._whole = elapsed == 0
 
-    def collect(self, actor: Floats, shape: Shape, normaliser: Normaliser) -> Trajectory:
+    def collect(self, actor: Floats, shape: Shape, features: Features) -> Trajectory:
         """Gathers one epoch with the policy held fixed.
 
         Args:
             actor: the actor's parameters [P + a], see networks.gaussian.
             shape: its layer sizes.
-            normaliser: of the observations; not changed.
+            features: of the observations; not changed.
 
         Returns:
             The trajectory; self.figures has taken in the episodes that ended on the way.
         """
-        T, N, a = self.horizon, self.env.num_envs, shape.outputs
+        T, N, a = self.config.horizon, self.env.num_envs, shape.outputs
+        n = self._observation.shape[1]
         act = Inference(actor, shape)
-        mean_inverse = normaliser.scale()
         out = Trajectory(
-            observation=np.empty((T + 1, N, shape.inputs), np.float32),
+            observation=np.empty((T + 1, N, n), np.float32),
             action=np.empty((T, N, a), np.float32),
             mean=np.empty((T, N, a), np.float32),
             reward=np.empty((T, N), np.float32),
             cost=np.empty((T, N), np.float32),
             ended=np.zeros((T, N), np.bool_),
             terminated=np.zeros((T, N), np.bool_),
-            final_observation=np.empty((0, shape.inputs), np.float32),
+            final_observation=np.empty((0, n), np.float32),
         )
         noise = self.noise.standard_normal((T, N, a), np.float32) * np.exp(actor[shape.size :])
         final: list[npt.NDArray[Any]] = []
@@ -137,9 +138,9 @@ class Rollout:
         clock = perf_counter()
         for t in range(T):
             out.observation[t] = self._observation
-            out.mean[t] = act(self._observation, *mean_inverse)
+            out.mean[t] = act(features(self._observation))
             np.add(out.mean[t], noise[t], out=out.action[t])
-            sent = np.clip(out.action[t], self._low, self._high)
+            sent = self.actions.sent(out.action[t])
             now = perf_counter()
             self.seconds["inference"] += now - clock
             observation, reward, terminated, truncated, info = self.env.step(sent)
@@ -151,7 +152,7 @@ class Rollout:
             self._return += reward
             self._cost += info.get("task_cost", info["cost"])
             self._constrained += info["cost"]
-            self._length += 1
+            self._length += self.config.action_repeat
             if ended.any():
                 out.ended[t], out.terminated[t] = ended, terminated
                 final.append(np.asarray(info["final_obs"][ended], np.float32))
@@ -159,7 +160,7 @@ class Rollout:
         out.observation[T] = self._observation
         out.final_observation = np.concatenate([out.final_observation, *final])
         self.figures.fresh = self.figures.total - fresh
-        self.figures.step_cost = float(out.cost.mean(dtype=np.float64))
+        self.figures.step_cost = float(out.cost.mean(dtype=np.float64)) / self.config.action_repeat
         return out
 
     def _close(self, ended: npt.NDArray[np.bool_]) -> None:
@@ -222,7 +223,7 @@ class Rollout:
 
 
 class Inference:
-    """The policy's mean action for a few observations at a time.
+    """The policy's mean for a few observations at a time.
 
     In numpy: at 40 rows torch spends more time on dispatch than on arithmetic.
     """
@@ -232,11 +233,9 @@ class Inference:
         self._layers = (w1.reshape(-1, HIDDEN), b1), (w2.reshape(HIDDEN, HIDDEN), b2)
         self._output = w3.reshape(HIDDEN, -1), b3
 
-    def __call__(self, observation: npt.NDArray[np.floating], mean: Floats, inverse: Floats) -> Floats:
-        """Mean actions [N, a] for raw observations [N, n], normalised by mean [n] and 1 / deviation [n]."""
-        h: Floats = np.subtract(observation, mean, dtype=np.float32)
-        h *= inverse
-        np.clip(h, -5.0, 5.0, out=h)
+    def __call__(self, inputs: Floats) -> Floats:
+        """Mean draws [N, a] for the networks' inputs [N, m]."""
+        h = inputs
         for w, b in self._layers:
             h = h @ w
             h += b

@@ -21,6 +21,7 @@ from gymnasium.vector import VectorEnv
 from rich.console import Console
 
 from trainer import checkpoint
+from trainer.actions import action_range
 from trainer.algorithms import ALGORITHMS, prepare_environments
 from trainer.algorithms.base import Algorithm
 from trainer.config import FILE as CONFIG
@@ -84,11 +85,11 @@ class Run:
         self.config = config
         self.folder = folder
         self.rng = np.random.default_rng(config.seed)
-        self.bounds = _box(env.single_action_space)
+        self.actions = action_range(config, _box(env.single_action_space))
         seen = _box(env.single_observation_space)
-        self.learner = Learner(config, seen.shape[0], self.bounds.shape[0], self.rng)
+        self.learner = Learner(config, seen.shape[0], self.actions, self.rng)
         self.algorithm: Algorithm = ALGORITHMS[config.algorithm](self.learner)
-        self.rollout = Rollout(env, config.horizon, config.episode_steps, config.seed, self.rng)
+        self.rollout = Rollout(env, config, self.rng, self.actions)
         self.epoch = 0
         self.saved = 0
 
@@ -106,11 +107,11 @@ class Run:
         learner, rollout = self.learner, self.rollout
         learner.start_epoch(self.steps / self.config.total_steps)
         actor = learner.actor.detach().numpy()
-        trajectory = rollout.collect(actor, learner.actor_shape, learner.normaliser)
+        trajectory = rollout.collect(actor, learner.actor_shape, learner.features)
         figures = rollout.figures
         logged = self.algorithm.update(self.algorithm.batch(trajectory), figures)
         seen = trajectory.observation[:-1]
-        learner.normaliser.update(seen.reshape(-1, seen.shape[-1]))
+        learner.features.normaliser.update(seen.reshape(-1, seen.shape[-1]))
         self.epoch += 1
         fresh = figures.fresh
         return {
@@ -141,8 +142,7 @@ class Run:
             "progress_bytes": written,
             "rng": self.rng.bit_generator.state,
             "algorithm": self.algorithm.state(),
-            "action_low": self.bounds.low.tolist(),
-            "action_high": self.bounds.high.tolist(),
+            "actions": {k: v.tolist() for k, v in dataclasses.asdict(self.actions).items()},
         }
         checkpoint.write(self.folder, arrays, facts)
         self.saved = self.epoch
@@ -193,7 +193,7 @@ def train(
     started = perf_counter()
     config, folder, resumed = prepare(config)
     torch.set_num_threads(1)  # jobs run side by side instead, see Learner
-    with closing(prepare_environments(config.algorithm, make(config))) as env:
+    with closing(prepare_environments(config.algorithm, make(config), config.action_repeat)) as env:
         run = Run(config, folder, env)
         length = run.load() if resumed and (folder / checkpoint.FILE).exists() else 0
         table = ProgressFile(folder, length)
@@ -309,10 +309,13 @@ def load_config(folder: Path) -> Config:
     """
     path = folder / CONFIG
     try:
-        config = Config(**json.loads(path.read_text()))
+        values = json.loads(path.read_text())
+        if values["action_range"] is not None:
+            values["action_range"] = tuple(values["action_range"])
+        config = Config(**values)
     except FileNotFoundError as error:
         raise CheckpointError(f"{folder} is no run: it holds no {CONFIG}") from error
-    except (OSError, ValueError, TypeError) as error:
+    except (OSError, ValueError, TypeError, KeyError) as error:
         raise CheckpointError(f"{path} cannot be read: {error}") from error
     check(config)
     return config

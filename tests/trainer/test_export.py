@@ -48,6 +48,7 @@ def test_the_graphs_compute_what_torch_computes(run, bundle):
     trained = TrainedRun(run)
     rng = np.random.default_rng(0)
     observation = rng.normal(0, 3, (50, 60)).astype(np.float32)
+    observation[:, 12:] = rng.random((50, 48))  # lidar readings
     for data, name, expected in (
         (bundle.policy, "action", trained.actions(observation)),
         (bundle.multiplier, "multiplier", trained.multipliers(observation)),

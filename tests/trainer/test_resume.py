@@ -25,7 +25,8 @@ SHORT = ["--task", "PointGoal0-v0", "--total-steps", "8000", "--num-envs", "10",
 
 def tiny(algorithm, out, **settings):
     return Config(
-        algorithm=algorithm, out=out, episode_steps=20, num_envs=10, epoch_steps=200, total_steps=2000,
+        algorithm=algorithm, task="Tiny", action_repeat=1,
+        out=out, episode_steps=20, num_envs=10, epoch_steps=200, total_steps=2000,
         minibatch=100, passes=2, threads=1, tensorboard=False, checkpoint_every=3, fisher_every=1, **settings,
     )  # fmt: skip
 

@@ -8,6 +8,7 @@ import torch
 from torch import nn
 from torch.distributions import Independent, Normal
 
+from trainer.actions import ActionRange
 from trainer.algorithms import ALGORITHMS
 from trainer.config import Config
 from trainer.errors import NonFiniteError
@@ -21,11 +22,12 @@ T, N, OBS, ACT = 30, 4, 5, 2
 def make(algorithm, **settings):
     """An algorithm after one step of random experience, its batch and figures; one minibatch, one pass."""
     config = Config(
-        algorithm=algorithm, out=Path("unused"), num_envs=N, epoch_steps=T * N, minibatch=T * N, passes=1,
+        algorithm=algorithm, task="Tiny", action_repeat=1,
+        out=Path("unused"), num_envs=N, epoch_steps=T * N, minibatch=T * N, passes=1,
         threads=1, kl_stop=10.0, episode_steps=10, **settings,
     )  # fmt: skip
     rng = np.random.default_rng(5)
-    learner = Learner(config, OBS, ACT, rng)
+    learner = Learner(config, OBS, ActionRange(*np.float32([[1] * ACT, [-9] * ACT, [9] * ACT])), rng)
     with torch.no_grad():  # away from the initial policy, whose mean is almost zero
         learner.actor += 0.1 * torch.from_numpy(rng.normal(size=learner.actor.shape).astype(np.float32))
     rule = ALGORITHMS[algorithm](learner)

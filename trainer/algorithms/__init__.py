@@ -14,6 +14,7 @@ from trainer.algorithms.ppo import PPO
 from trainer.algorithms.ppo_lag import PPOLag
 from trainer.algorithms.scpo import SCPO, MaximumCost
 from trainer.algorithms.trpo_lag import TRPOLag
+from trainer.repeat import Repeat
 
 ALGORITHMS: dict[str, type[Algorithm]] = {
     "ppo": PPO,
@@ -28,6 +29,9 @@ ALGORITHMS: dict[str, type[Algorithm]] = {
 }
 
 
-def prepare_environments(algorithm: str, env: VectorEnv[Any, Any, Any]) -> VectorEnv[Any, Any, Any]:
+def prepare_environments(
+    algorithm: str, env: VectorEnv[Any, Any, Any], action_repeat: int
+) -> VectorEnv[Any, Any, Any]:
     """The vector environment as the algorithm wants to see it."""
-    return MaximumCost(env) if algorithm == "scpo" else env
+    inner = MaximumCost(env) if algorithm == "scpo" else env
+    return Repeat(inner, action_repeat) if action_repeat > 1 else inner

@@ -14,8 +14,9 @@ class Algorithm:
         self.config = learner.config
 
     def batch(self, trajectory: Trajectory) -> Batch:
-        """The epoch's samples, with the reward's and the cost's advantages both discounted by γ."""
-        return self.learner.batch(trajectory, self.config.discount, cost_outlives_episode=True)
+        """The epoch's samples."""
+        discount = self.config.per_decision(self.config.cost_discount)
+        return self.learner.batch(trajectory, discount, cost_outlives_episode=True)
 
     def update(self, batch: Batch, figures: Figures) -> dict[str, float]:
         """One update on one epoch.

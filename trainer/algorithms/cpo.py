@@ -107,7 +107,7 @@ def _project(value: float, low: float, high: float) -> float:
 class CPO(Algorithm):
     """One constrained trust-region step an epoch, with a line search that checks the surrogates.
 
-    In the paper's form c = (J_c − d) / H, in the units of the surrogate E[r A_c], which is a mean over steps.
+    In the paper's form c = (J_c − d) / H, in the units of the surrogate E[r A_c], a mean over decisions.
     OmniSafe's form differs in two respects: c = J_c − d, and r has the other sign (it puts the ascent
     direction where the paper has the gradient of what is minimised).
     """
@@ -136,7 +136,7 @@ def cpo_update(learner: Learner, batch: Batch, excess: float) -> dict[str, float
     """
     config = learner.config
     paper = config.cpo_form == "paper"
-    c = excess / config.episode_steps if paper else excess
+    c = excess / config.episode_decisions if paper else excess
     before = surrogates(learner, batch, batch.reward_advantage)
     (g,) = torch.autograd.grad(before.reward, learner.actor, retain_graph=True)
     (b,) = torch.autograd.grad(before.cost, learner.actor)

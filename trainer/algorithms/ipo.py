@@ -40,7 +40,7 @@ def omnisafe_penalty(episode_cost: float, limit: float, kappa: float) -> float:
 class IPO(Algorithm):
     """Maximises PPO's surrogate + log(d − Ĵ_c) / t, with Ĵ_c = J_c + H · E[(r − 1) A_c].
 
-    Ĵ_c is the episode cost to first order in the policy's change: H steps, each of which changes by the
+    Ĵ_c is the episode cost to first order in the policy's change: H decisions, each of which changes by the
     mean of (r − 1) A_c. With ipo_form "omnisafe", PPO on (A − p A_c) / (1 + p) instead.
     """
 
@@ -55,7 +55,7 @@ class IPO(Algorithm):
 
         def loss(ratio: Tensor, block: slice) -> Tensor:
             change = ((ratio - 1) * batch.cost_advantage[block]).mean()
-            excess = cost + config.episode_steps * change - config.cost_limit
+            excess = cost + config.episode_decisions * change - config.cost_limit
             reward = clipped_surrogate(ratio, batch.reward_advantage[block], config.clip)
             return reward + log_barrier(excess, config.ipo_sharpness)
 

@@ -72,13 +72,14 @@ class LagnetForesight(Algorithm):
     def targets(self, batch: Batch) -> Tensor:
         """C̄(s_t) = Σ γ_f^k C_{t+k}, λ-returns with the network's own value at the ends [B]."""
         config, trajectory = self.config, batch.trajectory
+        discount = config.per_decision(config.foresight)
         T, N = trajectory.cost.shape
         with torch.no_grad():
-            seen = self.learner.normalised(trajectory.observation)
+            seen = self.learner.inputs(trajectory.observation)
             values = self.network.raw(seen).view(T + 1, N).numpy()
-            final = self.network.raw(self.learner.normalised(trajectory.final_observation)).numpy()
+            final = self.network.raw(self.learner.inputs(trajectory.final_observation)).numpy()
         after = successor_values(values, trajectory.ended, trajectory.terminated, final)
-        ahead = gae(trajectory.cost, values, after, trajectory.ended, config.foresight, config.gae)
+        ahead = gae(trajectory.cost, values, after, trajectory.ended, discount, config.gae)
         return torch.from_numpy((ahead + values[:-1]).reshape(-1)[batch.order])
 
     def multiplier_network(self) -> MultiplierNetwork:

@@ -27,9 +27,9 @@ class MultiplierNetwork:
         self.scale = 1.0
 
     def raw(self, observation: Tensor) -> Tensor:
-        """softplus(f_ξ(s)) [B] of normalised observations [B, n]."""
+        """softplus(f_ξ(s)) [B] for the networks' inputs [B, m]."""
         return softplus(fast_mlp(self.parameters, observation, self._shape)[:, 0])
 
     def __call__(self, observation: Tensor) -> Tensor:
-        """λ_ξ(s) [B] of normalised observations [B, n]."""
+        """λ_ξ(s) [B] for the networks' inputs [B, m]."""
         return self.scale * self.raw(observation)

@@ -8,7 +8,7 @@ from torch import Tensor
 from trainer.algorithms.base import Algorithm
 from trainer.critics import check_finite, fit_critics
 from trainer.learner import Batch, Learner
-from trainer.losses import clipped_surrogate
+from trainer.losses import clipped_surrogate, saturation_loss
 from trainer.networks import kl_divergence, log_probability
 from trainer.rollout import Figures
 
@@ -66,6 +66,8 @@ def improve_policy(learner: Learner, batch: Batch, policy_loss: PolicyLoss) -> d
             log_prob = log_probability(mean, log_std, batch.action[block])
             ratio = (log_prob - batch.log_prob[block]).exp()
             loss = policy_loss(ratio, block) - config.entropy * log_std.sum()
+            if config.saturation:
+                loss = loss + config.saturation * saturation_loss(mean, learner.edge)
             (gradient,) = torch.autograd.grad(loss, learner.actor)
             with torch.no_grad():
                 divergence = kl_divergence(batch.mean[block], batch.log_std, mean, log_std)
