@@ -7,16 +7,17 @@ import os
 import select
 import subprocess
 import sys
+import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import IO, Self
 
 from monitor import Gate
 from server.serve import KEY_VARIABLE
 
-_START_SECONDS = 60.0
+_START_SECONDS = 180.0
 _STOP_SECONDS = 10.0
 
 
@@ -31,17 +32,24 @@ class Service:
     Attributes:
         process: its process.
         url: where it listens.
+        errors: the file that holds what it writes to its standard error.
     """
 
     process: subprocess.Popen[str]
     url: str
+    errors: IO[str]
+
+    def complaints(self) -> str:
+        """What it has written to its standard error so far."""
+        self.errors.seek(0)
+        return self.errors.read()
 
     @staticmethod
     def start(bundle: Path, gate: Gate, threshold: float | None = None) -> Service:
         """Starts `lagnet-serve` on a free port of the loopback.
 
         Raises:
-            ServiceError: if it ends or does not listen within a minute.
+            ServiceError: if it ends or does not listen within three minutes (a first start compiles).
         """
         command = [sys.executable, "-m", "server.serve", str(bundle), "--port", "0", "--gate", gate]
         if threshold is not None:
@@ -53,21 +61,23 @@ class Service:
         """Runs a command that prints one line of JSON with its "url" once it listens.
 
         Raises:
-            ServiceError: if it ends or does not listen within a minute.
+            ServiceError: if it ends or does not listen within three minutes (a first start compiles).
         """
         # It is ours alone and asks for no key, unless the command names one.
         environment = {name: value for name, value in os.environ.items() if name != KEY_VARIABLE}
         # A session of its own: Ctrl-C in the terminal reaches us alone, and we stop the service in order.
+        # A file, not a pipe: nobody reads it while the service runs, and a full pipe would block it.
+        errors = tempfile.TemporaryFile("w+")  # noqa: SIM115  (it lives as long as the service)
         process = subprocess.Popen(
             command,
             stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
+            stderr=errors,
             text=True,
             start_new_session=True,
             env=environment | {"OMP_NUM_THREADS": "1"},
         )
         try:
-            return Service(process, _read_url(process))
+            return Service(process, _read_url(process, errors), errors)
         except BaseException:
             _stop(process)
             raise
@@ -87,15 +97,17 @@ class Service:
         self.stop()
 
 
-def _read_url(process: subprocess.Popen[str]) -> str:
-    if process.stdout is None or process.stderr is None:
+def _read_url(process: subprocess.Popen[str], errors: IO[str]) -> str:
+    if process.stdout is None:
         raise ServiceError("the service has no output")
     ready, _, _ = select.select([process.stdout], [], [], _START_SECONDS)
     line = process.stdout.readline() if ready else ""
     if not line:
         _stop(process)
-        said = process.stderr.read().strip() or "it did not listen in time"
-        raise ServiceError(f"the service did not start: {said}")
+        errors.seek(0)
+        raise ServiceError(
+            f"the service did not start: {errors.read().strip() or 'it did not listen in time'}"
+        )
     return str(json.loads(line)["url"])
 
 

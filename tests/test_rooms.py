@@ -43,7 +43,10 @@ def test_a_room_imports_only_what_it_may(room: str) -> None:
     for path in (ROOT / room).rglob("*.py"):
         for module in imports(path):
             if module.split(".")[0] in MAY_IMPORT:
-                assert any(module == name or module.startswith(f"{name}.") for name in allowed), (path, module)
+                assert any(module == name or module.startswith(f"{name}.") for name in allowed), (
+                    path,
+                    module,
+                )
 
 
 @pytest.mark.parametrize("room", RUNTIME)
