@@ -15,6 +15,8 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit("Python 3.11 or newer is needed, this is " + sys.version.split()[0] if sys.version_info < (3, 11) else 0)'
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[train,sweep,test]'
+	@# Loading a bundle compiles the filter; its machine code is kept beside the source.
+	$(BIN)/python -c 'from monitor import Monitor; Monitor.load("$(BUNDLE)")'
 	touch $@
 
 demo: setup ## the robot in MuJoCo, driven through POST /act, with and without the filter
