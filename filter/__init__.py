@@ -4,6 +4,7 @@ from filter.barrier_filter import BarrierFilter, committed_backup
 from filter.config import FilterConfig
 from filter.errors import FilterError, FilterInputError, SolverError
 from filter.result import SAFE_ACTION, FilterMemory, FilterResult, Mode, Row
+from filter.wrapper import SafetyFilter
 
 __all__ = [
     "SAFE_ACTION",
@@ -15,6 +16,7 @@ __all__ = [
     "FilterResult",
     "Mode",
     "Row",
+    "SafetyFilter",
     "SolverError",
     "committed_backup",
 ]

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from filter.config import FilterConfig, settings
 from filter.errors import FilterInputError, SolverError
-from filter.kernel import PASSES, finish, prepare
+from filter.kernel import MOST_PLAN, PASSES, PLAN, SIDE, finish, prepare
 from filter.lidar import CONES
 from filter.obstacles import COLUMNS
 from filter.qp import Problem
@@ -113,12 +113,12 @@ class BarrierFilter:
         n = len(seen)
         given = None if hazards is None else _check_hazards(hazards, n)
         gate = np.ones(n, dtype=np.bool_) if active is None else _check_active(active, n)
-        side = np.zeros(n, dtype=np.int8) if memory is None else _check_memory(memory, n)
+        past = np.zeros((n, 2), dtype=np.int8) if memory is None else _check_memory(memory, n)
         parts = []
         for start in range(0, max(n, 1), _CHUNK):
             part = slice(start, start + _CHUNK)
             hazards_part = None if given is None else given[part]
-            parts.append(self._filter(seen[part], nominal[part], hazards_part, gate[part], side[part]))
+            parts.append(self._filter(seen[part], nominal[part], hazards_part, gate[part], past[part]))
         return FilterResult.concatenate(parts)
 
     def problem(
@@ -140,7 +140,8 @@ class BarrierFilter:
         """
         seen, nominal = _check_inputs(np.asarray(observation)[None], np.asarray(nominal_action)[None])
         given = None if hazards is None else _check_hazards(np.asarray(hazards)[None], 1)
-        work = self._prepare(seen, nominal, given, np.ones(1, dtype=np.bool_), np.zeros(1, dtype=np.int8))
+        past = np.zeros((1, 2), dtype=np.int8)
+        work = self._prepare(seen, nominal, given, np.ones(1, dtype=np.bool_), past)
         return self._problem(work, 0) if work.rows[0] >= 0 else None
 
     def _prepare(
@@ -149,9 +150,9 @@ class BarrierFilter:
         nominal: FloatArray,
         given: FloatArray | None,
         active: BoolArray,
-        side: NDArray[np.int8],
+        memory: NDArray[np.int8],
     ) -> _Work:
-        """Build the QPs of n robots; the memory ``side`` is overwritten."""
+        """Build the QPs of n robots; the memory (n, 2) is overwritten."""
         n, width = seen.shape
         columns = _COLUMNS[width]
         hazards = columns.hazards if given is None else slice(0, 0)
@@ -179,7 +180,7 @@ class BarrierFilter:
             np.ascontiguousarray(seen[:, columns.goal]),
             nominal,
             active,
-            side,
+            memory,
             work.obstacles,
             work.source,
             work.count,
@@ -220,11 +221,11 @@ class BarrierFilter:
         nominal: FloatArray,
         given: FloatArray | None,
         active: BoolArray,
-        side: NDArray[np.int8],
+        memory: NDArray[np.int8],
     ) -> FilterResult:
         n = len(seen)
-        side = side.copy()
-        work = self._prepare(seen, nominal, given, active, side)
+        memory = memory.copy()
+        work = self._prepare(seen, nominal, given, active, memory)
         action = nominal.copy()
         mode, row, reason = np.zeros((3, n), dtype=np.int8)
         reasons: list[str | None] = [None] * n
@@ -237,15 +238,18 @@ class BarrierFilter:
                 work.count,
                 work.barrier,
                 work.rows,
+                given is None,
                 solution,
                 solved,
                 action,
                 mode,
                 row,
                 reason,
+                memory,
             )
             reasons = [REASONS[code] for code in reason.tolist()]
-        return FilterResult(action, mode, work.barrier, work.hazard, row, reasons, FilterMemory(side))
+        after = FilterMemory(memory[:, SIDE], memory[:, PLAN])
+        return FilterResult(action, mode, work.barrier, work.hazard, row, reasons, after)
 
 
 _default = BarrierFilter()
@@ -298,10 +302,13 @@ def _check_active(active: ArrayLike, n: int) -> BoolArray:
 
 
 def _check_memory(memory: FilterMemory, n: int) -> NDArray[np.int8]:
-    side = np.ascontiguousarray(memory.side, dtype=np.int8)
-    if side.shape != (n,):
-        raise FilterInputError("memory", f"expected that of {n} robots, got shape {side.shape}")
-    return side
+    if memory.side.shape != (n,) or memory.plan.shape != (n,):
+        shapes = f"{memory.side.shape} and {memory.plan.shape}"
+        raise FilterInputError("memory", f"expected that of {n} robots, got shapes {shapes}")
+    past = np.empty((n, 2), dtype=np.int8)
+    past[:, SIDE] = memory.side
+    past[:, PLAN] = np.where((memory.plan >= 0) & (memory.plan <= MOST_PLAN), memory.plan, 0)
+    return past
 
 
 def _array(field: str, values: ArrayLike) -> FloatArray:

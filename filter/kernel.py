@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from filter.backups import STEPS, best_backup
+from filter.backups import BACKUPS, STEPS, best_backup
 from filter.certificate import certify
 from filter.compiled import SOURCES, compiled, entry
 from filter.config import Settings
@@ -16,7 +16,7 @@ from filter.detour import drives_round, shortest_path, steer
 from filter.lidar import decode, decode_goal, likeliest
 from filter.obstacles import FAR, least_gap
 from filter.qp import build_rows
-from filter.recovery import commit, drive_out
+from filter.recovery import commit, drive_out, first_action
 from filter.robot import State, stopping
 from pointgoal.observation import LIDAR_RANGE
 
@@ -31,6 +31,10 @@ NO_ROW, BARRIER_ROW, DETOUR_ROW, SEARCH_ROW, BACKUP_ROW = 0, 1, 2, 3, 4
 """Values of `Row`."""
 NO_REASON, COMMITTED, INSIDE, TOO_FAST = 0, 1, 2, 3
 """Indices into `REASONS`."""
+SIDE, PLAN = 0, 1
+"""Columns of the memory; see `FilterMemory`."""
+MOST_PLAN = BACKUPS * (STEPS + 1)
+"""Largest number that stands for a plan."""
 PASSES, DRIVES_ROUND = -1, -2
 """In place of a number of rows: the nominal action passes; the detour's action is certified as it is."""
 _GRID = 5
@@ -110,7 +114,7 @@ def _detour(
     state: State,
     nominal: FloatArray,
     refused: bool,
-    sides: ByteArray,
+    memory: ByteArray,
     reference: FloatArray,
 ) -> tuple[bool, int]:
     """Whether to drive round something, and which disc that is.
@@ -127,14 +131,14 @@ def _detour(
         state: the measured state.
         nominal: (2,).
         refused: whether the nominal action has no certificate.
-        sides: (1,) the remembered side; receives the new one.
+        memory: (2,) its remembered side is read, and the new one written.
         reference: (2,) receives the QP's reference, if so.
 
     Returns:
         Whether to, and the disc in the way, -1 if it is not known.
     """
-    side = sides[0]
-    sides[0] = 0
+    side = memory[SIDE]
+    memory[SIDE] = 0
     seen, goal_x, goal_y = goal
     if config.lookahead <= 0.0 or not seen:
         return False, -1
@@ -142,7 +146,7 @@ def _detour(
     way = shortest_path(discs, count, (goal_x, goal_y), (now.zx, now.zy), side, config.steadiness)
     blocked = way.blocker >= 0 and way.distance < config.lookahead
     if blocked:
-        sides[0] = way.side
+        memory[SIDE] = way.side
         if not refused and drives_round(config, discs, count, state, nominal, way):
             return False, -1
     elif not (refused and math.hypot(now.zx, now.zy) < config.slow):
@@ -154,8 +158,31 @@ def _detour(
 
 
 @compiled
+def _plan(backup: int, steps: int) -> int:
+    """A backup and its steps of thrust as one number above 0."""
+    return 1 + backup + BACKUPS * steps
+
+
+@compiled
+def _go_on(config: Settings, state: State, memory: ByteArray) -> tuple[float, float]:
+    """The next action (u1, u2) of the plan of the last certificate; the memory keeps the rest of it."""
+    backup = (memory[PLAN] - 1) % BACKUPS
+    steps = (memory[PLAN] - 1) // BACKUPS
+    if steps == 0:
+        return 0.0, 0.0
+    memory[PLAN] = _plan(backup, steps - 1)
+    return first_action(config, backup, stopping(config.robot, state))
+
+
+@compiled
 def _search(
-    config: Settings, obstacles: FloatArray, count: int, state: State, x: FloatArray, action: FloatArray
+    config: Settings,
+    obstacles: FloatArray,
+    count: int,
+    state: State,
+    x: FloatArray,
+    action: FloatArray,
+    memory: ByteArray,
 ) -> bool:
     """The certified action nearest to x on a grid, in the QP's norm; False if there is none."""
     limit = config.robot.force_limit
@@ -165,8 +192,12 @@ def _search(
         for j in range(_GRID):
             w = 1.0 - 2.0 * j / (_GRID - 1)
             cost = config.thrust_weight * (f - x[0]) ** 2 + (w - x[1]) ** 2
-            if cost < best and certify(config, obstacles, count, state, f * limit, w, 0.0)[0] >= 0.0:
+            if cost >= best:
+                continue
+            value, _, backup, steps = certify(config, obstacles, count, state, f * limit, w, 0.0)
+            if value >= 0.0:
                 best = cost
+                memory[PLAN] = _plan(backup, steps)
                 action[0] = f * limit
                 action[1] = w
     return best < FAR
@@ -181,15 +212,24 @@ def _why(config: Settings, here: float, barrier: float) -> int:
 
 
 @compiled
+def _moves(config: Settings, state: State) -> bool:
+    """Whether there is still motion for a plan to stop."""
+    now = stopping(config.robot, state)
+    return math.hypot(now.zx, now.zy) > config.keep_off
+
+
+@compiled
 def _repair(
     config: Settings,
     obstacles: FloatArray,
     count: int,
     state: State,
     barrier: float,
+    scanned: bool,
     solved: bool,
     solution: FloatArray,
     action: FloatArray,
+    memory: ByteArray,
 ) -> tuple[int, int, int]:
     """Turn a QP's solution into an action to send: itself, else the nearest certified one, else the way out.
 
@@ -199,9 +239,11 @@ def _repair(
         count: how many of them there are.
         state: the measured state.
         barrier: of the state [m].
+        scanned: whether the obstacles come from the lidar.
         solved: whether there is a solution.
         solution: (2,) it, or the reference.
         action: (2,) receives u1, u2.
+        memory: (2,) its plan is read, and the new one written.
 
     Returns:
         Mode, row and reason.
@@ -209,18 +251,26 @@ def _repair(
     thrust = solution[0] * config.robot.force_limit
     turn = solution[1]
     least = config.hysteresis
-    if solved and certify(config, obstacles, count, state, thrust, turn, least)[0] >= least:
+    value, _, backup, steps = certify(config, obstacles, count, state, thrust, turn, least)
+    if solved and value >= least:
         action[0] = thrust
         action[1] = turn
+        memory[PLAN] = _plan(backup, steps)
         return FILTERED, BARRIER_ROW, NO_REASON
     here, _ = least_gap(obstacles, count, 0.0, 0.0, 0.0, 0.0, -1, -FAR)
-    if here >= 0.0 and _search(config, obstacles, count, state, solution, action):
+    if here >= 0.0 and _search(config, obstacles, count, state, solution, action, memory):
         return FILTERED, SEARCH_ROW, NO_REASON
     reason = _why(config, here, barrier)
-    if reason == COMMITTED:
-        thrust, turn = commit(config, obstacles, count, state)
-    else:
+    if reason == INSIDE:
         thrust, turn = drive_out(config, obstacles, count, state)
+        memory[PLAN] = 0
+    elif scanned and memory[PLAN] > 0 and _moves(config, state):
+        # A scan can leave places possible that the last one had ruled out. The plan was certified against
+        # those that were possible then, and the hazards are among them.
+        reason = COMMITTED
+        thrust, turn = _go_on(config, state, memory)
+    else:
+        thrust, turn = commit(config, obstacles, count, state)
     action[0] = thrust
     action[1] = turn
     return FALLBACK, BACKUP_ROW, reason
@@ -234,7 +284,7 @@ def _screen(
     readings: FloatArray,
     goal: FloatArray,
     nominal: FloatArray,
-    side: ByteArray,
+    memory: ByteArray,
     obstacles: FloatArray,
     source: IntArray,
     count: int,
@@ -252,18 +302,24 @@ def _screen(
     work, discs, labels = scratch
     limit = config.robot.force_limit
     least = config.hysteresis
-    value, at, _, _ = certify(config, obstacles, count, state, nominal[0], nominal[1], least)
+    value, at, backup, steps = certify(config, obstacles, count, state, nominal[0], nominal[1], least)
     refused = value < least
     m = _discs(config, given, readings, discs, labels)
-    detour, blocker = _detour(config, discs, m, decode_goal(goal), state, nominal, refused, side, reference)
+    detour, blocker = _detour(config, discs, m, decode_goal(goal), state, nominal, refused, memory, reference)
     if not (refused or detour):
+        memory[PLAN] = _plan(backup, steps)
         return PASSES, -1
     hazard = labels[blocker] if detour and blocker >= 0 else source[at]
     if not detour:
         reference[0] = min(max(nominal[0] / limit, -1.0), 1.0)
         reference[1] = min(max(nominal[1], -1.0), 1.0)
-    elif certify(config, obstacles, count, state, reference[0] * limit, reference[1], least)[0] >= least:
-        return DRIVES_ROUND, hazard
+    else:
+        value, _, backup, steps = certify(
+            config, obstacles, count, state, reference[0] * limit, reference[1], least
+        )
+        if value >= least:
+            memory[PLAN] = _plan(backup, steps)
+            return DRIVES_ROUND, hazard
     return build_rows(config, obstacles, count, state, best, reference, G, h, work), hazard
 
 
@@ -279,7 +335,7 @@ def _prepare_entry() -> Callable[..., None]:
         goals: FloatArray,
         nominal: FloatArray,
         active: BoolArray,
-        sides: ByteArray,
+        memory: ByteArray,
         obstacles: FloatArray,
         source: IntArray,
         count: IntArray,
@@ -300,7 +356,7 @@ def _prepare_entry() -> Callable[..., None]:
             goals: (N, 16) the goal's lidar.
             nominal: (N, 2).
             active: (N,).
-            sides: (N,) the memory; overwritten.
+            memory: (N, 2); overwritten.
             obstacles: (N, M, COLUMNS), and all that follows, receive the results.
             source: (N, M) each obstacle's hazard or bin.
             count: (N,) how many obstacles there are.
@@ -318,16 +374,15 @@ def _prepare_entry() -> Callable[..., None]:
         for k in range(states.shape[0]):
             state = State(0.0, 0.0, 0.0, states[k, 0], states[k, 1], states[k, 2])
             near = obstacles[k]
-            side = sides[k : k + 1]
             rows[k] = PASSES
             hazard[k] = -1
             n = _obstacles(config, state, given[k], readings[k], near, source[k])
             count[k] = n
             best = best_backup(config, near, n, stopping(config.robot, state), FAR)
             barrier[k] = min(best[0], LIDAR_RANGE) if n > 0 else LIDAR_RANGE
-            if n == 0:
-                side[0] = 0
-            elif active[k]:
+            if n == 0 or not active[k]:
+                memory[k] = 0
+            else:
                 rows[k], hazard[k] = _screen(
                     config,
                     state,
@@ -335,7 +390,7 @@ def _prepare_entry() -> Callable[..., None]:
                     readings[k],
                     goals[k],
                     nominal[k],
-                    side,
+                    memory[k],
                     near,
                     source[k],
                     n,
@@ -360,12 +415,14 @@ def _finish_entry() -> Callable[..., None]:
         count: IntArray,
         barrier: FloatArray,
         rows: IntArray,
+        scanned: bool,
         solution: FloatArray,
         solved: BoolArray,
         action: FloatArray,
         mode: ByteArray,
         row: ByteArray,
         reason: ByteArray,
+        memory: ByteArray,
     ) -> None:
         """Turn the solutions into certified actions.
 
@@ -376,12 +433,14 @@ def _finish_entry() -> Callable[..., None]:
             count: (N,).
             barrier: (N,).
             rows: (N,).
+            scanned: whether the obstacles come from the lidar.
             solution: (N, 2) of the QPs, the reference where there is none.
             solved: (N,) whether there is one.
             action: (N, 2) the nominal ones; overwritten where they do not pass.
             mode: (N,) zeros; receives `Mode`.
             row: (N,) zeros; receives `Row`.
             reason: (N,) zeros; receives the index into `REASONS`.
+            memory: (N, 2), as ``prepare`` left it; overwritten.
         """
         if not sources:
             return
@@ -394,7 +453,16 @@ def _finish_entry() -> Callable[..., None]:
             elif rows[k] != PASSES:
                 state = State(0.0, 0.0, 0.0, states[k, 0], states[k, 1], states[k, 2])
                 mode[k], row[k], reason[k] = _repair(
-                    config, obstacles[k], count[k], state, barrier[k], solved[k], solution[k], action[k]
+                    config,
+                    obstacles[k],
+                    count[k],
+                    state,
+                    barrier[k],
+                    scanned,
+                    solved[k],
+                    solution[k],
+                    action[k],
+                    memory[k],
                 )
 
     return finish

@@ -33,6 +33,8 @@ def gap(obstacles: FloatArray, i: int, x: float, y: float) -> float:
     if obstacles[i, 2] == 0.0 and obstacles[i, 3] == 0.0:
         return math.sqrt(qx * qx + qy * qy) - float(obstacles[i, 4])
     length: float = math.sqrt(obstacles[i, 2] * obstacles[i, 2] + obstacles[i, 3] * obstacles[i, 3])
+    if length < 1e-9:
+        return math.sqrt(qx * qx + qy * qy) - float(obstacles[i, 4] + max(obstacles[i, 5], 0.0))
     growth = obstacles[i, 5] / length
     along = (qx * obstacles[i, 2] + qy * obstacles[i, 3]) / length
     aside = abs(qx * obstacles[i, 3] - qy * obstacles[i, 2]) / length

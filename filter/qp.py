@@ -52,6 +52,11 @@ class Problem:
         rows = ((self.G @ x - self.h) / scale).max(initial=0.0)
         return float(max(rows, (np.abs(x) - 1.0).max(), 0.0))
 
+    def scaled(self) -> tuple[FloatArray, FloatArray]:
+        """G and h with rows of length 1, which gives solvers' absolute tolerances a meaning."""
+        length = np.maximum(np.linalg.norm(self.G, axis=1), 1e-9)
+        return self.G / length[:, None], self.h / length
+
     def objective(self, x: FloatArray) -> float:
         """The weighted square distance from the reference, halved."""
         return float(0.5 * self.weights @ (x - self.reference) ** 2)

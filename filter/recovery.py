@@ -14,8 +14,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from filter.backups import BACKUPS, law
-from filter.certificate import certify
+from filter.backups import BACKUPS, best_backup, law
 from filter.compiled import compiled
 from filter.config import Settings
 from filter.obstacles import FAR, gap, least_gap
@@ -68,7 +67,7 @@ def _depths(settings: Settings, obstacles: FloatArray, count: int, x: float, y: 
 
 
 @compiled
-def _first(settings: Settings, candidate: int, start: Stopping) -> tuple[float, float]:
+def first_action(settings: Settings, candidate: int, start: Stopping) -> tuple[float, float]:
     """A candidate's first action (u1, u2)."""
     robot = settings.robot
     thrust, turn = _control(settings, candidate, start.heading, start)
@@ -87,7 +86,7 @@ def _harm(
     robot = settings.robot
     seconds = robot.physics_step * robot.substeps
     start = stopping(robot, state)
-    thrust, turn = _first(settings, candidate, start)
+    thrust, turn = first_action(settings, candidate, start)
     at = stopping(robot, advance(robot, state, thrust, turn, robot.substeps))
     harm = 0.0
     deepest = 0.0
@@ -108,21 +107,23 @@ def _harm(
 
 @compiled
 def commit(settings: Settings, obstacles: FloatArray, count: int, state: State) -> tuple[float, float]:
-    """The first action (u1, u2) that leaves the most clearance, of the backups' and of the extreme ones.
+    """The first action (u1, u2), of the backups and the extremes, that leaves a backup the most clearance.
 
-    It is for a state whose backups still keep out of the hazards, if not all of the margin.
+    What the robot is too near to now counts no more, so from a place within the margin it leads out.
     """
-    limit = settings.robot.force_limit
-    start = stopping(settings.robot, state)
+    robot = settings.robot
+    limit = robot.force_limit
+    start = stopping(robot, state)
     most = -FAR
     best_thrust = best_turn = 0.0
     for candidate in range(BACKUPS + 9):
         if candidate < BACKUPS:
-            thrust, turn = _first(settings, candidate, start)
+            thrust, turn = first_action(settings, candidate, start)
         else:
             thrust = limit * ((candidate - BACKUPS) // 3 - 1.0)
             turn = (candidate - BACKUPS) % 3 - 1.0
-        value = certify(settings, obstacles, count, state, thrust, turn, FAR)[0]
+        after = stopping(robot, advance(robot, state, thrust, turn, robot.substeps))
+        value = best_backup(settings, obstacles, count, after, FAR)[0]
         if value > most:
             most = value
             best_thrust = thrust
@@ -140,4 +141,4 @@ def drive_out(settings: Settings, obstacles: FloatArray, count: int, state: Stat
         if harm < least:
             least = harm
             best = candidate
-    return _first(settings, best, stopping(settings.robot, state))
+    return first_action(settings, best, stopping(settings.robot, state))

@@ -57,14 +57,17 @@ class FilterMemory:
 
     Attributes:
         side: (N,) int8, the side on which the robot passes what is in its way: 1 left, -1 right, 0 none.
+        plan: (N,) int8, the backup that the last action's certificate ends in, and its steps of thrust:
+            1 + backup + 3 * steps; 0 is none.
     """
 
     side: NDArray[np.int8]
+    plan: NDArray[np.int8]
 
     @staticmethod
     def empty(n: int) -> FilterMemory:
         """The memory of n robots before their first step."""
-        return FilterMemory(np.zeros(n, dtype=np.int8))
+        return FilterMemory(np.zeros(n, dtype=np.int8), np.zeros(n, dtype=np.int8))
 
 
 @dataclass(frozen=True)
@@ -103,5 +106,8 @@ class FilterResult:
             hazard=np.concatenate([part.hazard for part in parts]),
             row=np.concatenate([part.row for part in parts]),
             reason=[reason for part in parts for reason in part.reason],
-            memory=FilterMemory(np.concatenate([part.memory.side for part in parts])),
+            memory=FilterMemory(
+                side=np.concatenate([part.memory.side for part in parts]),
+                plan=np.concatenate([part.memory.plan for part in parts]),
+            ),
         )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,15 @@ FloatArray = NDArray[np.float64]
 TOLERANCE = 1e-6
 """Largest residual of a solution that is accepted."""
 _EPS = 1e-10
+_LEAST_ROWS = 8
+"""Rows of the smallest workspace of OSQP."""
+_BOX = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
+_OPTIONS: dict[str, dict[str, Any]] = {
+    "piqp": {"eps_abs": 1e-10, "eps_rel": 1e-10},
+    "proxqp": {"eps_abs": 1e-10, "eps_rel": 0.0},
+    "clarabel": {"tol_gap_abs": 1e-11, "tol_gap_rel": 1e-11, "tol_feas": 1e-11},
+}
+"""Accuracies beyond the solvers' own defaults."""
 
 Solver = Callable[[Problem], "FloatArray | None"]
 """Takes a problem, gives its solution, or None if the solver finds it infeasible; raises SolverError."""
@@ -147,43 +157,121 @@ def planar(problem: Problem) -> FloatArray | None:
     return x[0] if solved[0] else None
 
 
-def through_qpsolvers(name: str) -> Solver:
+class KeptOSQP:
+    """OSQP with kept workspaces: one a size, set up once and only updated afterwards.
+
+    Args:
+        eps: absolute and relative tolerance; OSQP's own 1e-3 lets limits drift.
+    """
+
+    def __init__(self, eps: float = 1e-8) -> None:
+        self._eps = eps
+        self._workspaces: dict[tuple[int, float, float], Any] = {}
+
+    def __call__(self, problem: Problem) -> FloatArray | None:
+        """Solve one problem.
+
+        Raises:
+            SolverError: if OSQP ends with neither a solution nor infeasibility.
+        """
+        import osqp
+
+        G, h = problem.scaled()
+        size = _LEAST_ROWS
+        while size < h.size:
+            size *= 2
+        # Rows that are left over ask for nothing: they are zero, with a bound above it.
+        A = np.zeros((size + 2, 2))
+        A[: h.size] = G
+        A[size:] = np.eye(2)
+        upper = np.ones(size + 2)
+        upper[: h.size] = h
+        lower = np.full(size + 2, -np.inf)
+        lower[size:] = -1.0
+        workspace = self._workspace(size, problem.weights)
+        workspace.update(q=-problem.weights * problem.reference, l=lower, u=upper, Ax=A.T.ravel())
+        result = workspace.solve()
+        if result.info.status_val in (
+            osqp.SolverStatus.OSQP_SOLVED,
+            osqp.SolverStatus.OSQP_SOLVED_INACCURATE,
+        ):
+            return np.asarray(result.x, dtype=np.float64)
+        if result.info.status_val in (
+            osqp.SolverStatus.OSQP_PRIMAL_INFEASIBLE,
+            osqp.SolverStatus.OSQP_PRIMAL_INFEASIBLE_INACCURATE,
+        ):
+            return None
+        raise SolverError(problem, f"osqp: {result.info.status}")
+
+    def _workspace(self, size: int, weights: FloatArray) -> Any:
+        """The workspace for so many rows: P and the places of A are fixed, all else is updated."""
+        import osqp
+        from scipy import sparse
+
+        key = (size, float(weights[0]), float(weights[1]))
+        if key not in self._workspaces:
+            rows = np.tile(np.arange(size + 2), 2)
+            columns = np.repeat([0, 1], size + 2)
+            A = sparse.csc_matrix((np.ones(2 * size + 4), (rows, columns)), shape=(size + 2, 2))
+            workspace = osqp.OSQP()
+            workspace.setup(
+                P=sparse.csc_matrix(np.diag(weights)),
+                q=np.zeros(2),
+                A=A,
+                l=np.full(size + 2, -np.inf),
+                u=np.ones(size + 2),
+                eps_abs=self._eps,
+                eps_rel=self._eps,
+                eps_prim_inf=self._eps,
+                max_iter=20_000,
+                verbose=False,
+            )
+            self._workspaces[key] = workspace
+        return self._workspaces[key]
+
+
+class ByQpsolvers:
     """A solver of qpsolvers by its name, for example "daqp", "quadprog" or "piqp".
 
     Raises:
         ValueError: if qpsolvers has no such solver installed.
     """
-    import qpsolvers
 
-    if name not in qpsolvers.available_solvers:
-        known = ", ".join(["planar", "osqp", *sorted(qpsolvers.available_solvers)])
-        raise ValueError(f"no QP solver {name!r}; installed are: {known}")
-    low, high = np.full(2, -1.0), np.full(2, 1.0)
-    box = np.vstack([np.eye(2), -np.eye(2)])
+    def __init__(self, name: str) -> None:
+        import qpsolvers
 
-    def solve(problem: Problem) -> FloatArray | None:
-        # Rows of length 1 keep the solvers' absolute tolerances meaningful; the box goes in as rows for the
-        # solvers that know no other form.
-        length = np.maximum(np.linalg.norm(problem.G, axis=1), 1e-9)
-        G = np.vstack([problem.G / length[:, None], box])
-        h = np.concatenate([problem.h / length, high, -low])
+        if name not in qpsolvers.available_solvers:
+            known = ", ".join(["planar", "osqp", *sorted(qpsolvers.available_solvers)])
+            raise ValueError(f"no QP solver {name!r}; there are: {known}")
+        self._name = name
+
+    def __call__(self, problem: Problem) -> FloatArray | None:
+        """Solve one problem.
+
+        Raises:
+            SolverError: if the solver breaks down.
+        """
+        import qpsolvers
+
+        G, h = problem.scaled()
+        P, q = np.diag(problem.weights), -problem.weights * problem.reference
+        # The box goes in as rows, the one form that every solver takes; an exact box is clipped afterwards.
+        rows, bounds = np.vstack([G, _BOX]), np.concatenate([h, np.ones(4)])
         try:
-            x = qpsolvers.solve_qp(
-                np.diag(problem.weights), -problem.weights * problem.reference, G, h, solver=name
-            )
+            x = qpsolvers.solve_qp(P, q, rows, bounds, solver=self._name, **_OPTIONS.get(self._name, {}))
         except qpsolvers.SolverError as error:
-            raise SolverError(problem, f"{name}: {error}") from error
+            raise SolverError(problem, f"{self._name}: {error}") from error
         return None if x is None else np.asarray(x, dtype=np.float64)
-
-    return solve
 
 
 def make_solver(name: str) -> Solver:
-    """The solver of a name.
+    """The solver of a name: "planar", "osqp" or one of qpsolvers'.
 
     Raises:
         ValueError: if there is no such solver.
     """
     if name == "planar":
         return planar
-    return through_qpsolvers(name)
+    if name == "osqp":
+        return KeptOSQP()
+    return ByQpsolvers(name)

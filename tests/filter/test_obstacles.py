@@ -1,0 +1,67 @@
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from filter.obstacles import FAR, gap, gap_segment, least_gap
+
+places = st.floats(-2.0, 2.0)
+cones = st.tuples(places, places, places, places, st.floats(0.05, 0.4), st.floats(-0.04, 0.6))
+
+
+def rows(*cones):
+    out = np.zeros((len(cones), 7))
+    out[:, :6] = cones
+    for i in range(len(cones)):
+        out[i, 6] = gap(out, i, 0.0, 0.0)
+    return out
+
+
+def brute(cone, points):
+    """Distance from points (n, 2) to many of the discs that a cone is made of."""
+    at = np.linspace(0.0, 1.0, 400)[:, None]
+    centres = np.array(cone[:2]) + at * np.array(cone[2:4])
+    radii = cone[4] + at[:, 0] * cone[5]
+    return (np.linalg.norm(points[:, None] - centres[None], axis=2) - radii).min(axis=1)
+
+
+@settings(deadline=None, max_examples=150)
+@given(cone=cones, x=places, y=places)
+def test_gap_is_the_distance_to_the_nearest_disc(cone, x, y):
+    expected = brute(cone, np.array([[x, y]]))[0]
+    assert abs(gap(rows(cone), 0, x, y) - expected) < 0.01
+    assert gap(rows(cone), 0, x, y) <= expected + 1e-9
+
+
+@settings(deadline=None, max_examples=100)
+@given(cone=cones, start=st.tuples(places, places), end=st.tuples(places, places))
+def test_gap_to_a_segment_is_the_least_on_its_way(cone, start, end):
+    way = np.linspace(0.0, 1.0, 300)[:, None]
+    expected = min(gap(rows(cone), 0, *point) for point in np.array(start) + way * np.subtract(end, start))
+    found = gap_segment(rows(cone), 0, *start, *end, FAR)
+    # Outside it is smooth, and found to a quarter of a millimetre; inside only that it is inside matters.
+    assert found <= expected + (1e-3 if expected > 0.0 else 0.015)
+    assert found >= expected - 0.01
+
+
+def test_hazard_is_found_exactly():
+    disc = rows((1.0, 0.5, 0.0, 0.0, 0.2, 0.0))
+    assert abs(gap_segment(disc, 0, 0.0, 0.0, 2.0, 0.0, FAR) - 0.3) < 1e-12
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    some=st.lists(cones, min_size=1, max_size=6),
+    start=st.tuples(places, places),
+    end=st.tuples(places, places),
+    first=st.integers(-1, 5),
+)
+def test_least_gap_is_the_least_of_all(some, start, end, first):
+    obstacles = rows(*some)
+    expected = [gap_segment(obstacles, i, *start, *end, FAR) for i in range(len(some))]
+    found, nearest = least_gap(obstacles, len(some), *start, *end, first if first < len(some) else -1, -FAR)
+    assert abs(found - min(expected)) < 1e-3
+    assert expected[nearest] < min(expected) + 1e-3
+
+
+def test_nothing_is_far():
+    assert least_gap(np.empty((0, 7)), 0, 0.0, 0.0, 1.0, 0.0, -1, -FAR) == (FAR, -1)
