@@ -90,15 +90,17 @@ class Config:
     multiplier_learning_rate: float = 3e-4
     """lagnet: Adam's step size for the multiplier network's ascent on eq. 15."""
     multiplier_passes: int = 1
-    """lagnet, lagnet-foresight: passes over an epoch for the multiplier network (at most `passes`)."""
+    """lagnet: passes of that ascent over an epoch (at most `passes`)."""
 
-    foresight: float = 0.95
-    """lagnet-foresight: discount γ_f of the future cost that C̄_ξ(s) adds up (0.95: about 0.4 s)."""
-    foresight_init: float = 0.1
+    foresight: float = 0.99
+    """lagnet-foresight: discount γ_f of the future cost that C̄_ξ(s) adds up, a control step (0.99: 2 s)."""
+    foresight_init: float = 0.25
     """lagnet-foresight: the value C̄_ξ(s) starts at in every state."""
     foresight_learning_rate: float = 1e-3
     """lagnet-foresight: Adam's step size for the regression of C̄_ξ."""
-    scale_init: float = 20.0
+    foresight_passes: int = 5
+    """lagnet-foresight: passes of that regression over an epoch (at most `passes`)."""
+    scale_init: float = 30.0
     """lagnet-foresight: the value the scale β starts at; λ_ξ(s) = β C̄_ξ(s)."""
     scale_gain: float = 0.05
     """lagnet-foresight: log β moves by this much an epoch for each relative excess of the cost over d."""
@@ -173,7 +175,8 @@ _POSITIVE = (
     "minibatch",
     "learning_rate", "critic_learning_rate", "clip", "kl_stop", "gradient_clip",
     "multiplier_learning_rate", "multiplier_passes", "checkpoint_every", "foresight_init",
-    "foresight_learning_rate", "scale_init", "scale_step", "limit_share", "dual_learning_rate", "pid_delay",
+    "foresight_learning_rate", "foresight_passes", "scale_init", "scale_step", "limit_share",
+    "dual_learning_rate", "pid_delay",
     "ipo_sharpness", "ipo_kappa", "trust_kl", "cg_iterations", "fisher_every",
 )  # fmt: skip
 _NOT_NEGATIVE = (

@@ -58,7 +58,7 @@ class LagnetForesight(Algorithm):
         config = self.config
         targets = self.targets(batch)
         mean = 0.0
-        for blocks in batch.schedule[: config.multiplier_passes]:
+        for blocks in batch.schedule[: config.foresight_passes]:
             losses = []
             for block in blocks:
                 loss = (self.network.raw(batch.observation[block]) - targets[block]).square().mean()
