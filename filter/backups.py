@@ -23,6 +23,7 @@ from filter.robot import Stopping, follow
 
 FloatArray = NDArray[np.float64]
 
+_TINY = 1e-9
 FORWARD, REVERSE, TURN = 0, 1, 2
 BACKUPS = 3
 """How many backup manoeuvres there are."""
@@ -70,6 +71,7 @@ def clearance(
     start: Stopping,
     enough: float,
     first: int,
+    exact: bool,
 ) -> tuple[float, int, int]:
     """The best clearance that a backup reaches over the number of steps for which it thrusts.
 
@@ -81,6 +83,7 @@ def clearance(
         start: the reduced state.
         enough: stop looking at a clearance of this much [m].
         first: the obstacle to look at first; -1 for any.
+        exact: whether the clearance matters below ``enough``, too; else it is only known to be below.
 
     Returns:
         The clearance [m], after ``travel_error``; the obstacle that bounds it, -1 if none; the steps of
@@ -96,7 +99,7 @@ def clearance(
     travelled = 0.0
     for step in range(STEPS + 1):
         rest = settings.travel_error * (travelled + math.hypot(at.zx - at.x, at.zy - at.y))
-        floor = best + rest
+        floor = (best if exact else max(best, enough - _TINY)) + rest
         end, at_end = least_gap(obstacles, count, at.x, at.y, at.zx, at.zy, first, floor)
         first = at_end
         value = min(end, path) - rest
@@ -114,7 +117,8 @@ def clearance(
             on_path = nearest
         travelled += math.hypot(after.x - at.x, after.y - at.y)
         at = after
-        if path - settings.travel_error * travelled <= best:
+        left = path - settings.travel_error * travelled
+        if left <= best or not (exact or left >= enough):
             break
     return best, blocker, steps
 
@@ -158,7 +162,8 @@ def best_backup(
         obstacles: (M, COLUMNS), radii with the margin.
         count: how many of them there are.
         start: the reduced state.
-        enough: stop looking at a clearance of this much [m].
+        enough: stop looking at a clearance of this much [m]; `FAR` for the exact one. Below it, the clearance
+            is only known to be below.
 
     Returns:
         The clearance [m], the obstacle that bounds it, which backup, and for how many steps it thrusts.
@@ -167,16 +172,18 @@ def best_backup(
     blocker = -1
     # No manoeuvre is farther from an obstacle than the robot is now.
     here, nearest = least_gap(obstacles, count, start.x, start.y, start.x, start.y, -1, -FAR)
-    enough = min(enough, here - 1e-9)
+    exact = enough >= FAR
+    if here < enough and not exact:
+        return here, nearest, 0, 0
+    enough = min(enough, here - _TINY)
     chosen = 0
     steps = 0
     # The one that brakes comes first: it is the likeliest to do.
     ahead = (start.zx - start.x) * math.cos(start.heading) + (start.zy - start.y) * math.sin(start.heading)
     for turn in range(BACKUPS):
         kind = turn if ahead < 0.0 or turn == TURN else 1 - turn
-        value, at, count_steps = clearance(
-            settings, kind, obstacles, count, start, enough, blocker if blocker >= 0 else nearest
-        )
+        first = blocker if blocker >= 0 else nearest
+        value, at, count_steps = clearance(settings, kind, obstacles, count, start, enough, first, exact)
         if value > best:
             best, blocker, chosen, steps = value, at, kind, count_steps
         if best >= enough:

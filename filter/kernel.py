@@ -264,9 +264,9 @@ def _repair(
     if reason == INSIDE:
         thrust, turn = drive_out(config, obstacles, count, state)
         memory[PLAN] = 0
-    elif scanned and memory[PLAN] > 0 and _moves(config, state):
-        # A scan can leave places possible that the last one had ruled out. The plan was certified against
-        # those that were possible then, and the hazards are among them.
+    elif reason == TOO_FAST and scanned and memory[PLAN] > 0 and _moves(config, state):
+        # A scan can leave places possible that the last one had ruled out, and then no backup keeps out of
+        # them all. The plan was certified against those possible then, and the hazards are among them.
         reason = COMMITTED
         thrust, turn = _go_on(config, state, memory)
     else:
