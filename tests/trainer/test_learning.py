@@ -12,7 +12,7 @@ SETTINGS = {
     "ppo": {},
     "ppo-lag": {"dual_learning_rate": 0.1, "dual_init": 0.5},
     "trpo-lag": {"dual_learning_rate": 0.1, "dual_init": 0.5},
-    "cppo-pid": {"pid_ki": 0.03, "pid_kp": 0.3, "dual_init": 2.5},
+    "cppo-pid": {"pid_ki": 0.03},
     "ipo": {},
     "cpo": {},
     "scpo": {"cost_limit": 20 * 0.25, "initial_log_std": -1.5},
