@@ -61,7 +61,7 @@ def test_wrapper_of_a_single_environment():
     told = []
     for _ in range(400):
         hazards = env.unwrapped.hazards_in_body_frame()
-        observation, _, _, _, info = env.step(attacker(hazards[None])[0])
+        _, _, _, _, info = env.step(attacker(hazards[None])[0])
         assert info["cost"] == 0.0
         told.append(info["filter"]["mode"])
     assert {"nominal", "filtered"} <= set(told)
