@@ -24,6 +24,8 @@ from filter.robot import Stopping, follow
 FloatArray = NDArray[np.float64]
 
 _TINY = 1e-9
+_AT_REST = 0.02
+"""Way to the stop point below which the robot counts as at rest [m]: 4 cm/s."""
 FORWARD, REVERSE, TURN = 0, 1, 2
 BACKUPS = 3
 """How many backup manoeuvres there are."""
@@ -55,6 +57,9 @@ def law(settings: Settings, kind: int, at: Stopping) -> tuple[float, float]:
     s = math.sin(at.heading)
     ahead = vx * c + vy * s
     aside = vy * c - vx * s
+    # At rest there is no line of motion to turn into, and turning would only swing the origin round.
+    if math.hypot(vx, vy) < _AT_REST:
+        return 0.0, 0.0
     # The axis has no front: against the motion is as good as along it.
     error = math.atan2(aside, ahead) if ahead >= 0.0 else math.atan2(-aside, -ahead)
     turn = min(max(error, -most), most)

@@ -213,9 +213,9 @@ def _why(config: Settings, here: float, barrier: float) -> int:
 
 @compiled
 def _moves(config: Settings, state: State) -> bool:
-    """Whether there is still motion for a plan to stop."""
+    """Whether there is motion worth a plan: at rest a plan would but turn the robot, and swing its origin."""
     now = stopping(config.robot, state)
-    return math.hypot(now.zx, now.zy) > config.keep_off
+    return math.hypot(now.zx, now.zy) > config.slow
 
 
 @compiled

@@ -63,7 +63,7 @@ def brake_clearance(state, hazards, hand):
     best = -np.inf
     for law in ("coast", "brake"):
         at, least = np.array(state), np.inf
-        for _ in range(200):
+        for _ in range(120):
             least = min(least, np.linalg.norm(hazards - at[:2], axis=1).min())
             ahead = at[3] * np.cos(at[2]) + at[4] * np.sin(at[2])
             thrust = 0.0 if law == "coast" else -0.05 * np.clip(ahead / 0.06, -1, 1)
@@ -73,7 +73,7 @@ def brake_clearance(state, hazards, hand):
 
 
 def test_what_is_emitted_can_be_survived(robot_filter, draw_scene, hand):
-    observation, action, hazards = batch(draw_scene, 60, seed=2)
+    observation, action, hazards = batch(draw_scene, 20, seed=2)
     result = robot_filter.filter(observation, action, hazards)
     survived = 0
     for k in np.flatnonzero(result.mode != Mode.FALLBACK):

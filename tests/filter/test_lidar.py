@@ -34,7 +34,7 @@ def obstacles(readings, reach=1.6, spread=0.0):
     return out[:count], source[:count]
 
 
-@settings(deadline=None, max_examples=600)
+@settings(deadline=None, max_examples=300)
 @given(hazards=st.one_of(st.lists(places, min_size=1, max_size=10), crowds))
 def test_no_true_hazard_is_ever_nearer_than_what_was_decoded(hand, hazards):
     cones, _ = obstacles(hand.scan(np.array(hazards)))
@@ -46,7 +46,7 @@ def test_no_true_hazard_is_ever_nearer_than_what_was_decoded(hand, hazards):
         assert inside <= -RADIUS + 1e-6
 
 
-@settings(deadline=None, max_examples=200)
+@settings(deadline=None, max_examples=60)
 @given(hazards=st.lists(places, min_size=1, max_size=8), spread=st.floats(-0.03, 0.03))
 def test_bearing_errors_are_covered(hand, hazards, spread):
     turned = [
@@ -58,7 +58,7 @@ def test_bearing_errors_are_covered(hand, hazards, spread):
             assert min((gap(cones, i, x, y) for i in range(len(cones))), default=np.inf) <= -RADIUS + 1e-6
 
 
-@settings(deadline=None, max_examples=100)
+@settings(deadline=None, max_examples=60)
 @given(distance=st.floats(0.25, 1.4), bearing=st.floats(-np.pi, np.pi))
 def test_a_hazard_alone_is_decoded_exactly(hand, distance, bearing):
     at = np.array([[distance * np.cos(bearing), distance * np.sin(bearing)]])
@@ -78,7 +78,7 @@ def test_out_of_range_is_nothing(hand):
     assert decode_goal(np.zeros(16)) == (False, 0.0, 0.0)
 
 
-@settings(deadline=None, max_examples=100)
+@settings(deadline=None, max_examples=60)
 @given(distance=st.floats(0.01, 2.99), bearing=st.floats(-np.pi, np.pi))
 def test_goal_is_exact(hand, distance, bearing):
     at = distance * np.cos(bearing), distance * np.sin(bearing)
