@@ -28,7 +28,7 @@ QUIET = Console(quiet=True)
 def small(out: Path, **changes) -> Sweep:
     settings = Sweep(
         algorithms=("ppo", "lagnet"), cost_limits=(0.5, 2.0), seeds=(3, 4), out=out, total_steps=4000,
-        epoch_steps=1000, tensorboard=False,
+        epoch_steps=1000, num_envs=40, action_repeat=5, tensorboard=False,
     )  # fmt: skip
     return replace(settings, **changes)
 
