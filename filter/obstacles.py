@@ -31,7 +31,7 @@ def gap(obstacles: FloatArray, i: int, x: float, y: float) -> float:
     qx = x - obstacles[i, 0]
     qy = y - obstacles[i, 1]
     if obstacles[i, 2] == 0.0 and obstacles[i, 3] == 0.0:
-        return math.sqrt(qx * qx + qy * qy) - float(obstacles[i, 4])
+        return math.sqrt(qx * qx + qy * qy) - float(obstacles[i, 4] + max(obstacles[i, 5], 0.0))
     length: float = math.sqrt(obstacles[i, 2] * obstacles[i, 2] + obstacles[i, 3] * obstacles[i, 3])
     if length < 1e-9:
         return math.sqrt(qx * qx + qy * qy) - float(obstacles[i, 4] + max(obstacles[i, 5], 0.0))
@@ -65,7 +65,7 @@ def gap_segment(
         at = min(max(at, 0.0), 1.0)
         qx = x0 + at * dx - obstacles[i, 0]
         qy = y0 + at * dy - obstacles[i, 1]
-        return math.sqrt(qx * qx + qy * qy) - float(obstacles[i, 4])
+        return math.sqrt(qx * qx + qy * qy) - float(obstacles[i, 4] + max(obstacles[i, 5], 0.0))
     # A cone is convex, so the distance along the segment is a convex function: golden section search.
     length = math.sqrt(square)
     start = gap(obstacles, i, x0, y0)

@@ -1,5 +1,5 @@
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from filter.obstacles import FAR, gap, gap_segment, least_gap
@@ -26,6 +26,7 @@ def brute(cone, points):
 
 @settings(deadline=None, max_examples=150)
 @given(cone=cones, x=places, y=places)
+@example(cone=(0.0, 0.0, 0.0, 0.0, 0.25, 0.5), x=0.0, y=0.0)
 def test_gap_is_the_distance_to_the_nearest_disc(cone, x, y):
     expected = brute(cone, np.array([[x, y]]))[0]
     assert abs(gap(rows(cone), 0, x, y) - expected) < 0.01
