@@ -29,6 +29,8 @@ class FilterConfig:
     """Bound on the error of a hazard's measured bearing [rad]."""
     travel_error: float = 0.0
     """Bound on how far a backup manoeuvre strays from the model's, as a share of its way."""
+    scan_margin: float = 0.02
+    """Kept besides with the lidar alone, where a scan can leave possible what the last had ruled out [m]."""
     hazard_radius: float = HAZARD_RADIUS
     """Radius of every hazard [m]."""
     rate: float = 0.5
@@ -60,7 +62,8 @@ class FilterConfig:
 
     def __post_init__(self) -> None:
         """Refuse settings that void the guarantee."""
-        shares = ("margin", "position_error", "bearing_error", "travel_error", "keep_off", "hysteresis")
+        errors = ("margin", "position_error", "bearing_error", "travel_error", "scan_margin")
+        shares = (*errors, "keep_off", "hysteresis")
         for name in shares:
             if not 0.0 <= getattr(self, name) < 1.0:
                 raise ValueError(f"{name} must be in [0, 1), got {getattr(self, name)!r}")
@@ -82,6 +85,7 @@ class Settings(NamedTuple):
     margin: float
     bearing_error: float
     travel_error: float
+    scan_margin: float
     hazard_radius: float
     rate: float
     keep_off: float

@@ -64,7 +64,7 @@ def _obstacles(
     """The obstacles within reach, from a lidar scan (16,) or, if that is empty, given ones; how many."""
     reach = _reach(config, state)
     if readings.size > 0:
-        grow = _grown(config, 0.0)
+        grow = _grown(config, 0.0) + config.scan_margin
         return decode(readings, reach + grow, grow, config.bearing_error, out, source)
     count = 0
     for i in range(given.shape[0]):
@@ -91,7 +91,7 @@ def _discs(
 ) -> int:
     """What to drive round: discs (x, y, radius) with the margin and a clearance; how many there are."""
     if readings.size > 0:
-        return likeliest(readings, _grown(config, 0.0) + config.clearance, out, source)
+        return likeliest(readings, _grown(config, 0.0) + config.scan_margin + config.clearance, out, source)
     count = 0
     for i in range(given.shape[0]):
         x, y = given[i]
@@ -204,11 +204,11 @@ def _search(
 
 
 @compiled
-def _why(config: Settings, here: float, barrier: float) -> int:
-    """The reason for a fallback, by the distance to an obstacle's edge now and by the barrier [m]."""
-    if here < -config.margin:
+def _why(margin: float, here: float, barrier: float) -> int:
+    """The reason for a fallback, by the margin, the distance to an edge now, and the barrier [m]."""
+    if here < -margin:
         return INSIDE
-    return TOO_FAST if barrier < -config.margin else COMMITTED
+    return TOO_FAST if barrier < -margin else COMMITTED
 
 
 @compiled
@@ -260,7 +260,8 @@ def _repair(
     here, _ = least_gap(obstacles, count, 0.0, 0.0, 0.0, 0.0, -1, -FAR)
     if here >= 0.0 and _search(config, obstacles, count, state, solution, action, memory):
         return FILTERED, SEARCH_ROW, NO_REASON
-    reason = _why(config, here, barrier)
+    margin = config.margin + config.scan_margin if scanned else config.margin
+    reason = _why(margin, here, barrier)
     if reason == INSIDE:
         thrust, turn = drive_out(config, obstacles, count, state)
         memory[PLAN] = 0
