@@ -4,7 +4,7 @@ from torch import Tensor
 
 from trainer.algorithms.base import Algorithm
 from trainer.algorithms.ppo import clipped_update
-from trainer.dual import AdamMultiplier, Numbers
+from trainer.dual import AdamMultiplier, Numbers, PidMultiplier
 from trainer.learner import Batch, Learner
 from trainer.rollout import Figures
 
@@ -19,7 +19,11 @@ class PPOLag(Algorithm):
 
     def __init__(self, learner: Learner) -> None:
         super().__init__(learner)
-        self.dual = AdamMultiplier(self.config.dual_init, self.config.dual_learning_rate)
+        self.dual = self.make_dual()
+
+    def make_dual(self) -> AdamMultiplier | PidMultiplier:
+        """What moves λ."""
+        return AdamMultiplier(self.config.dual_init, self.config.dual_learning_rate)
 
     def update(self, batch: Batch, figures: Figures) -> dict[str, float]:
         """One update on one epoch, see Algorithm.update."""
