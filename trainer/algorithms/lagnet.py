@@ -8,7 +8,6 @@ from torch import Tensor
 from trainer.algorithms.base import Algorithm
 from trainer.algorithms.multiplier import MultiplierNetwork
 from trainer.algorithms.ppo import proximal_update
-from trainer.critics import check_finite
 from trainer.learner import Batch, Learner
 from trainer.losses import clipped_surrogate, cost_surrogate, multiplier_loss
 from trainer.rollout import Figures
@@ -67,19 +66,12 @@ class Lagnet(Algorithm):
 
     def _ascend(self, batch: Batch) -> float:
         """Passes of minibatch ascent on eq. 15; returns the mean loss of the last one."""
-        config = self.config
-        mean = 0.0
-        for blocks in batch.schedule[: config.multiplier_passes]:
-            losses = []
-            for block in blocks:
-                multiplier = self.network(batch.observation[block])
-                loss = multiplier_loss(multiplier, batch.cost[block], config.state_limit)
-                (gradient,) = torch.autograd.grad(loss, self.network.parameters)
-                self.learner.descend("multiplier", gradient)
-                losses.append(loss.detach())
-            mean = float(torch.stack(losses).mean())
-            check_finite({"multiplier loss": mean})
-        return mean
+        limit = self.config.state_limit
+
+        def loss(block: slice) -> Tensor:
+            return multiplier_loss(self.network(batch.observation[block]), batch.cost[block], limit)
+
+        return self.network.descend(batch.schedule[: self.config.multiplier_passes], loss)
 
     def multiplier_network(self) -> MultiplierNetwork:
         """λ_ξ."""

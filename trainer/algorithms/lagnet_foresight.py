@@ -15,7 +15,6 @@ from trainer.advantage import gae, successor_values
 from trainer.algorithms.base import Algorithm
 from trainer.algorithms.lagnet import statewise_update
 from trainer.algorithms.multiplier import MultiplierNetwork
-from trainer.critics import check_finite
 from trainer.dual import Numbers, number
 from trainer.learner import Batch, Learner
 from trainer.rollout import Figures
@@ -55,19 +54,12 @@ class LagnetForesight(Algorithm):
 
     def _regress(self, batch: Batch) -> float:
         """Passes of minibatch regression of C̄_ξ; returns the mean loss of the last one."""
-        config = self.config
         targets = self.targets(batch)
-        mean = 0.0
-        for blocks in batch.schedule[: config.foresight_passes]:
-            losses = []
-            for block in blocks:
-                loss = (self.network.raw(batch.observation[block]) - targets[block]).square().mean()
-                (gradient,) = torch.autograd.grad(loss, self.network.parameters)
-                self.learner.descend("multiplier", gradient)
-                losses.append(loss.detach())
-            mean = float(torch.stack(losses).mean())
-            check_finite({"multiplier loss": mean})
-        return mean
+
+        def loss(block: slice) -> Tensor:
+            return (self.network.raw(batch.observation[block]) - targets[block]).square().mean()
+
+        return self.network.descend(batch.schedule[: self.config.foresight_passes], loss)
 
     def targets(self, batch: Batch) -> Tensor:
         """C̄(s_t) = Σ γ_f^k C_{t+k}, λ-returns with the network's own value at the ends [B]."""
