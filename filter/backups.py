@@ -19,18 +19,27 @@ from numpy.typing import NDArray
 from filter.compiled import compiled
 from filter.config import Settings
 from filter.obstacles import FAR, gap, gap_segment, least_gap
-from filter.robot import Stopping, follow
+from filter.robot import Robot, Stopping, follow
 
 FloatArray = NDArray[np.float64]
 
 _TINY = 1e-9
 _AT_REST = 0.02
 """Way to the stop point below which the robot counts as at rest [m]: 4 cm/s."""
+_SHARE = 0.5
+"""Share of the speed along its axis that a turning robot brakes within a step, at most."""
 FORWARD, REVERSE, TURN = 0, 1, 2
 BACKUPS = 3
 """How many backup manoeuvres there are."""
 STEPS = 20
 """Control steps for which a backup thrusts at most: 0.4 s; a full brake from top speed takes 0.36 s."""
+
+
+@compiled
+def steered(robot: Robot, error: float) -> float:
+    """The turn u2 in [-1, 1] that takes an error [rad] from the heading within a control step, or near."""
+    gain = (robot.gear * robot.gear + robot.yaw_drag) / robot.gear
+    return min(max(gain * error / (robot.physics_step * robot.substeps), -1.0), 1.0)
 
 
 @compiled
@@ -43,14 +52,13 @@ def law(settings: Settings, kind: int, at: Stopping) -> tuple[float, float]:
         at: the reduced state.
 
     Returns:
-        The share of full thrust in [-1, 1], and the change of the heading over a control step [rad].
+        The share of full thrust, and u2, both in [-1, 1].
     """
     if kind == FORWARD:
         return 1.0, 0.0
     if kind == REVERSE:
         return -1.0, 0.0
     robot = settings.robot
-    most = robot.gear / (robot.gear * robot.gear + robot.yaw_drag) * robot.physics_step * robot.substeps
     vx = at.zx - at.x
     vy = at.zy - at.y
     c = math.cos(at.heading)
@@ -58,13 +66,12 @@ def law(settings: Settings, kind: int, at: Stopping) -> tuple[float, float]:
     ahead = vx * c + vy * s
     aside = vy * c - vx * s
     # At rest there is no line of motion to turn into, and turning would only swing the origin round.
-    if math.hypot(vx, vy) < _AT_REST:
-        return 0.0, 0.0
+    fade = min(max(math.hypot(vx, vy) / _AT_REST - 1.0, 0.0), 1.0)
     # The axis has no front: against the motion is as good as along it.
     error = math.atan2(aside, ahead) if ahead >= 0.0 else math.atan2(-aside, -ahead)
-    turn = min(max(error, -most), most)
+    turn = steered(robot, error)
     reach = robot.gear * robot.force_limit / robot.drag * robot.physics_step * robot.substeps
-    return min(max(-ahead / reach, -1.0), 1.0), turn
+    return fade * min(max(-_SHARE * ahead / reach, -1.0), 1.0), fade * turn
 
 
 @compiled
@@ -94,7 +101,6 @@ def clearance(
         The clearance [m], after ``travel_error``; the obstacle that bounds it, -1 if none; the steps of
         thrust.
     """
-    seconds = settings.robot.physics_step * settings.robot.substeps
     at = start
     best = -FAR
     blocker = first
@@ -115,7 +121,7 @@ def clearance(
         if best >= enough or step == STEPS:
             break
         thrust, turn = law(settings, kind, at)
-        after = follow(settings.robot, at, thrust, turn, seconds)
+        after = follow(settings.robot, at, thrust, turn)
         distance, nearest = least_gap(obstacles, count, at.x, at.y, after.x, after.y, first, best)
         if distance < path:
             path = distance
@@ -139,14 +145,13 @@ def clearances(
     out: FloatArray,
 ) -> None:
     """Write the clearance [m] of a backup with a given number of steps of thrust from each obstacle."""
-    seconds = settings.robot.physics_step * settings.robot.substeps
     at = start
     travelled = 0.0
     for i in range(count):
         out[i] = gap(obstacles, i, at.x, at.y)
     for _ in range(steps):
         thrust, turn = law(settings, kind, at)
-        after = follow(settings.robot, at, thrust, turn, seconds)
+        after = follow(settings.robot, at, thrust, turn)
         for i in range(count):
             out[i] = min(out[i], gap_segment(obstacles, i, at.x, at.y, after.x, after.y, out[i]))
         travelled += math.hypot(after.x - at.x, after.y - at.y)

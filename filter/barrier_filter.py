@@ -56,6 +56,7 @@ class _Work:
     """What passes from the building of n robots' QPs to their repair; see `kernel.prepare`."""
 
     states: FloatArray
+    readings: FloatArray
     obstacles: FloatArray
     source: IntArray
     count: IntArray
@@ -159,9 +160,10 @@ class BarrierFilter:
         if given is None:
             given = np.empty((n, 0, 2))
         size = given.shape[1] if hazards.stop == 0 else CONES
-        states, readings = seen[:, columns.motion], seen[:, hazards]
+        states, readings = seen[:, columns.motion], np.ascontiguousarray(seen[:, hazards])
         work = _Work(
             states=states,
+            readings=readings,
             obstacles=np.empty((n, size, COLUMNS)),
             source=np.empty((n, size), dtype=np.int64),
             count=np.empty(n, dtype=np.int64),
@@ -176,7 +178,7 @@ class BarrierFilter:
             self._settings,
             states,
             given,
-            np.ascontiguousarray(readings),
+            readings,
             np.ascontiguousarray(seen[:, columns.goal]),
             nominal,
             active,
@@ -238,7 +240,7 @@ class BarrierFilter:
                 work.count,
                 work.barrier,
                 work.rows,
-                given is None,
+                work.readings,
                 solution,
                 solved,
                 action,

@@ -8,6 +8,9 @@ from typing import NamedTuple
 from filter.robot import Robot
 from pointgoal.observation import HAZARD_RADIUS
 
+MODEL_ERROR = 0.003
+"""What the robot strays at most from the manoeuvre that was certified, from its start to its end [m]."""
+
 
 @dataclass(frozen=True)
 class FilterConfig:
@@ -29,8 +32,6 @@ class FilterConfig:
     """Bound on the error of a hazard's measured bearing [rad]."""
     travel_error: float = 0.0
     """Bound on how far a backup manoeuvre strays from the model's, as a share of its way."""
-    scan_margin: float = 0.02
-    """Kept besides with the lidar alone, where a scan can leave possible what the last had ruled out [m]."""
     hazard_radius: float = HAZARD_RADIUS
     """Radius of every hazard [m]."""
     rate: float = 0.5
@@ -62,7 +63,7 @@ class FilterConfig:
 
     def __post_init__(self) -> None:
         """Refuse settings that void the guarantee."""
-        errors = ("margin", "position_error", "bearing_error", "travel_error", "scan_margin")
+        errors = ("margin", "position_error", "bearing_error", "travel_error")
         shares = (*errors, "keep_off", "hysteresis")
         for name in shares:
             if not 0.0 <= getattr(self, name) < 1.0:
@@ -83,9 +84,9 @@ class Settings(NamedTuple):
 
     robot: Robot
     margin: float
+    sure: float
     bearing_error: float
     travel_error: float
-    scan_margin: float
     hazard_radius: float
     rate: float
     keep_off: float
@@ -102,6 +103,11 @@ class Settings(NamedTuple):
 
 def settings(config: FilterConfig) -> Settings:
     """The numbers of a configuration."""
-    names = [name for name in Settings._fields if name not in ("robot", "margin")]
+    names = [name for name in Settings._fields if name not in ("robot", "margin", "sure")]
     numbers = {name: float(getattr(config, name)) for name in names}
-    return Settings(robot=config.robot, margin=config.margin + config.position_error, **numbers)
+    return Settings(
+        robot=config.robot,
+        margin=config.margin + config.position_error,
+        sure=MODEL_ERROR + config.position_error,
+        **numbers,
+    )

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from filter.backups import steered
 from filter.compiled import compiled
 from filter.config import Settings
 from filter.robot import State, advance, stopping
@@ -232,9 +233,7 @@ def steer(
             uy -= push * discs[i, 1] / away
     error = math.atan2(uy * settings.pursuit - at.zy, ux * settings.pursuit - at.zx) - at.heading
     error = math.atan2(math.sin(error), math.cos(error))
-    robot = settings.robot
-    most = robot.gear / (robot.gear * robot.gear + robot.yaw_drag) * robot.physics_step * robot.substeps
-    turn = min(max(0.7 * error / most, -1.0), 1.0)
+    turn = steered(settings.robot, 0.7 * error)
     thrust = min(max(settings.eagerness * math.cos(error), -1.0), 1.0)
     return thrust, turn
 

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from filter.backups import BACKUPS, STEPS, best_backup
+from filter.backups import BACKUPS, FORWARD, STEPS, best_backup
 from filter.certificate import certify
 from filter.compiled import SOURCES, compiled, entry
 from filter.config import Settings
@@ -64,7 +64,7 @@ def _obstacles(
     """The obstacles within reach, from a lidar scan (16,) or, if that is empty, given ones; how many."""
     reach = _reach(config, state)
     if readings.size > 0:
-        grow = _grown(config, 0.0) + config.scan_margin
+        grow = _grown(config, 0.0)
         return decode(readings, reach + grow, grow, config.bearing_error, out, source)
     count = 0
     for i in range(given.shape[0]):
@@ -91,7 +91,7 @@ def _discs(
 ) -> int:
     """What to drive round: discs (x, y, radius) with the margin and a clearance; how many there are."""
     if readings.size > 0:
-        return likeliest(readings, _grown(config, 0.0) + config.scan_margin + config.clearance, out, source)
+        return likeliest(readings, _grown(config, 0.0) + config.clearance, out, source)
     count = 0
     for i in range(given.shape[0]):
         x, y = given[i]
@@ -204,16 +204,60 @@ def _search(
 
 
 @compiled
-def _why(margin: float, here: float, barrier: float) -> int:
-    """The reason for a fallback, by the margin, the distance to an edge now, and the barrier [m]."""
-    if here < -margin:
+def _why(margin: float, edge: float, barrier: float) -> int:
+    """The reason for a fallback, by the margin, the distance to a hazard's edge, and the barrier [m]."""
+    if edge < 0.0:
         return INSIDE
     return TOO_FAST if barrier < -margin else COMMITTED
 
 
 @compiled
+def _fall_back(
+    config: Settings,
+    obstacles: FloatArray,
+    count: int,
+    state: State,
+    barrier: float,
+    here: float,
+    edge: float,
+    scanned: bool,
+    action: FloatArray,
+    memory: ByteArray,
+) -> int:
+    """Find the action to send where nothing keeps the whole margin; arguments as for `_repair`.
+
+    Returns:
+        The reason.
+    """
+    reason = _why(config.margin, edge, barrier)
+    if reason == INSIDE:
+        action[0], action[1] = drive_out(config, obstacles, count, state)
+        memory[PLAN] = 0
+        return reason
+    # What the model errs by, and the sensors, is kept whatever happens; the rest of the margin is not. A
+    # robot that stands nearer than that may go wherever it comes no nearer.
+    least = min(config.sure - config.margin, 0.0)
+    if not _moves(config, state):
+        least = min(least, here)
+    thrust, turn, kept, backup, steps = commit(config, obstacles, count, state, least)
+    if kept:
+        memory[PLAN] = _plan(backup, steps)
+        reason = COMMITTED
+    elif scanned and memory[PLAN] > 0:
+        # A scan can leave places possible that the last one had ruled out, and then no backup keeps out of
+        # them all. The plan was certified against those possible then, and the hazards are among them.
+        thrust, turn = _go_on(config, state, memory)
+        reason = COMMITTED
+    else:
+        memory[PLAN] = 0
+    action[0] = thrust
+    action[1] = turn
+    return reason
+
+
+@compiled
 def _moves(config: Settings, state: State) -> bool:
-    """Whether there is motion worth a plan: at rest a plan would but turn the robot, and swing its origin."""
+    """Whether there is motion worth a plan."""
     now = stopping(config.robot, state)
     return math.hypot(now.zx, now.zy) > config.slow
 
@@ -225,7 +269,7 @@ def _repair(
     count: int,
     state: State,
     barrier: float,
-    scanned: bool,
+    readings: FloatArray,
     solved: bool,
     solution: FloatArray,
     action: FloatArray,
@@ -239,7 +283,7 @@ def _repair(
         count: how many of them there are.
         state: the measured state.
         barrier: of the state [m].
-        scanned: whether the obstacles come from the lidar.
+        readings: (16,) the hazards' lidar, or (0,).
         solved: whether there is a solution.
         solution: (2,) it, or the reference.
         action: (2,) receives u1, u2.
@@ -260,20 +304,12 @@ def _repair(
     here, _ = least_gap(obstacles, count, 0.0, 0.0, 0.0, 0.0, -1, -FAR)
     if here >= 0.0 and _search(config, obstacles, count, state, solution, action, memory):
         return FILTERED, SEARCH_ROW, NO_REASON
-    margin = config.margin + config.scan_margin if scanned else config.margin
-    reason = _why(margin, here, barrier)
-    if reason == INSIDE:
-        thrust, turn = drive_out(config, obstacles, count, state)
-        memory[PLAN] = 0
-    elif reason == TOO_FAST and scanned and memory[PLAN] > 0 and _moves(config, state):
-        # A scan can leave places possible that the last one had ruled out, and then no backup keeps out of
-        # them all. The plan was certified against those possible then, and the hazards are among them.
-        reason = COMMITTED
-        thrust, turn = _go_on(config, state, memory)
-    else:
-        thrust, turn = commit(config, obstacles, count, state)
-    action[0] = thrust
-    action[1] = turn
+    # A scan tells how far the nearest hazard is, though not where.
+    scanned = readings.size > 0
+    edge = here + config.margin
+    if scanned:
+        edge = LIDAR_RANGE * (1.0 - np.max(readings)) - config.hazard_radius
+    reason = _fall_back(config, obstacles, count, state, barrier, here, edge, scanned, action, memory)
     return FALLBACK, BACKUP_ROW, reason
 
 
@@ -381,8 +417,11 @@ def _prepare_entry() -> Callable[..., None]:
             count[k] = n
             best = best_backup(config, near, n, stopping(config.robot, state), FAR)
             barrier[k] = min(best[0], LIDAR_RANGE) if n > 0 else LIDAR_RANGE
-            if n == 0 or not active[k]:
+            if not active[k]:
                 memory[k] = 0
+            elif n == 0:
+                # Nothing is within reach of any backup: to coast is a plan that the next scan cannot refute.
+                memory[k] = (0, _plan(FORWARD, 0))
             else:
                 rows[k], hazard[k] = _screen(
                     config,
@@ -416,7 +455,7 @@ def _finish_entry() -> Callable[..., None]:
         count: IntArray,
         barrier: FloatArray,
         rows: IntArray,
-        scanned: bool,
+        readings: FloatArray,
         solution: FloatArray,
         solved: BoolArray,
         action: FloatArray,
@@ -434,7 +473,7 @@ def _finish_entry() -> Callable[..., None]:
             count: (N,).
             barrier: (N,).
             rows: (N,).
-            scanned: whether the obstacles come from the lidar.
+            readings: (N, 16) the hazards' lidar, or (N, 0).
             solution: (N, 2) of the QPs, the reference where there is none.
             solved: (N,) whether there is one.
             action: (N, 2) the nominal ones; overwritten where they do not pass.
@@ -459,7 +498,7 @@ def _finish_entry() -> Callable[..., None]:
                     count[k],
                     state,
                     barrier[k],
-                    scanned,
+                    readings[k],
                     solved[k],
                     solution[k],
                     action[k],

@@ -14,7 +14,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from filter.backups import BACKUPS, best_backup, law
+from filter.backups import BACKUPS, best_backup, law, steered
 from filter.compiled import compiled
 from filter.config import Settings
 from filter.obstacles import FAR, gap, least_gap
@@ -36,19 +36,17 @@ _DELAY = 1e-3
 
 @compiled
 def _control(settings: Settings, candidate: int, heading: float, at: Stopping) -> tuple[float, float]:
-    """A candidate's share of full thrust and change of heading [rad]."""
+    """A candidate's share of full thrust and turn, both in [-1, 1]."""
     if candidate < BACKUPS:
         return law(settings, candidate, at)
     if candidate == BACKUPS:
         return 0.0, 0.0
-    robot = settings.robot
-    most = robot.gear / (robot.gear * robot.gear + robot.yaw_drag) * robot.physics_step * robot.substeps
     ring = (candidate - BACKUPS - 1) // 2
     forwards = 1.0 if (candidate - BACKUPS - 1) % 2 == 0 else -1.0
     error = heading + 2.0 * math.pi * ring / HEADINGS - at.heading
     error = math.atan2(math.sin(error), math.cos(error))
     thrust = forwards if math.cos(error) > _ALIGNED else 0.0
-    return thrust, min(max(error, -most), most)
+    return thrust, steered(settings.robot, error)
 
 
 @compiled
@@ -69,10 +67,8 @@ def _depths(settings: Settings, obstacles: FloatArray, count: int, x: float, y: 
 @compiled
 def first_action(settings: Settings, candidate: int, start: Stopping) -> tuple[float, float]:
     """A candidate's first action (u1, u2)."""
-    robot = settings.robot
     thrust, turn = _control(settings, candidate, start.heading, start)
-    most = robot.gear / (robot.gear * robot.gear + robot.yaw_drag) * robot.physics_step * robot.substeps
-    return thrust * robot.force_limit, turn / most
+    return thrust * settings.robot.force_limit, turn
 
 
 @compiled
@@ -84,7 +80,6 @@ def _harm(
     The first step is the exact model's, for the servo cannot reverse a turn at once.
     """
     robot = settings.robot
-    seconds = robot.physics_step * robot.substeps
     start = stopping(robot, state)
     thrust, turn = first_action(settings, candidate, start)
     at = stopping(robot, advance(robot, state, thrust, turn, robot.substeps))
@@ -99,36 +94,64 @@ def _harm(
         if depth == 0.0 and least_gap(obstacles, count, at.x, at.y, at.zx, at.zy, -1, 0.0)[0] >= 0.0:
             return harm
         thrust, turn = _control(settings, candidate, start.heading, at)
-        at = follow(robot, at, thrust, turn, seconds)
+        at = follow(robot, at, thrust, turn)
     # Still not clear: what is left of the motion counts as well.
     depth, deeper = _depths(settings, obstacles, count, at.zx, at.zy)
     return harm + _STEPS * depth + _DEEPER * max(deeper - deepest, 0.0)
 
 
 @compiled
-def commit(settings: Settings, obstacles: FloatArray, count: int, state: State) -> tuple[float, float]:
-    """The first action (u1, u2), of the backups and the extremes, that leaves a backup the most clearance.
+def commit(
+    settings: Settings, obstacles: FloatArray, count: int, state: State, least: float
+) -> tuple[float, float, bool, int, int]:
+    """The action, of the backups' first ones and the extremes, that leaves a backup the most clearance.
 
-    What the robot is too near to now counts no more, so from a place within the margin it leads out.
+    What the robot is too near to now counts no more, so from a place within the margin it leads out. Actions
+    that keep a clearance on their whole way go before those that do not.
+
+    Args:
+        settings: the filter's numbers.
+        obstacles: (M, COLUMNS), radii with the margin.
+        count: how many of them there are.
+        state: the measured state.
+        least: the clearance to keep [m].
+
+    Returns:
+        The action (u1, u2); whether it keeps that clearance; the backup that it ends in, and that one's steps
+        of thrust.
     """
     robot = settings.robot
     limit = robot.force_limit
     start = stopping(robot, state)
+    half = robot.substeps // 2
     most = -FAR
     best_thrust = best_turn = 0.0
+    kept = False
+    backup = steps = 0
     for candidate in range(BACKUPS + 9):
         if candidate < BACKUPS:
             thrust, turn = first_action(settings, candidate, start)
         else:
             thrust = limit * ((candidate - BACKUPS) // 3 - 1.0)
             turn = (candidate - BACKUPS) % 3 - 1.0
-        after = stopping(robot, advance(robot, state, thrust, turn, robot.substeps))
-        value = best_backup(settings, obstacles, count, after, FAR)[0]
-        if value > most:
+        middle = advance(robot, state, thrust, turn, half)
+        after = advance(robot, middle, thrust, turn, robot.substeps - half)
+        value, _, kind, thrusts = best_backup(settings, obstacles, count, stopping(robot, after), FAR)
+        if kept and value <= most:
+            continue
+        way, _ = least_gap(obstacles, count, state.x, state.y, middle.x, middle.y, -1, -FAR)
+        rest, _ = least_gap(obstacles, count, middle.x, middle.y, after.x, after.y, -1, -FAR)
+        keeps = min(value, way, rest) >= least
+        if value > most or (keeps and not kept):
+            if kept and not keeps:
+                continue
             most = value
             best_thrust = thrust
             best_turn = turn
-    return best_thrust, best_turn
+            kept = keeps
+            backup = kind
+            steps = thrusts
+    return best_thrust, best_turn, kept, backup, steps
 
 
 @compiled

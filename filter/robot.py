@@ -48,13 +48,8 @@ class Robot(NamedTuple):
 
     @property
     def turn_rate(self) -> float:
-        """Yaw rate that the servo settles at under a full turn control [rad/s]."""
-        return self.gear / (self.gear * self.gear + self.yaw_drag)
-
-    @property
-    def turn_deceleration(self) -> float:
-        """Largest change of the yaw rate by the servo [rad/s^2]."""
-        return self.gear * self.force_limit / (self.inertia - self.mass * self.offset**2)
+        """Yaw rate that the servo settles at under a full turn control [rad/s]: it saturates before."""
+        return self.gear * self.force_limit / self.yaw_drag
 
     @property
     def control_step(self) -> float:
@@ -80,7 +75,7 @@ class State(NamedTuple):
 
 
 class Stopping(NamedTuple):
-    """The reduced state: where the robot is, where it would come to rest without thrust, and its heading.
+    """The reduced state: where the robot is, where it would come to rest without thrust, and how it turns.
 
     Without thrust the momentum decays through drag alone, so the origin comes to rest exactly at
     p + tau * v_c, with v_c the velocity of the centre of mass and tau the time constant, however it turns on
@@ -98,7 +93,9 @@ class Stopping(NamedTuple):
     zy: float
     """Stop point [m]."""
     heading: float
-    """Heading once the servo has stopped the yaw [rad]."""
+    """Heading [rad]."""
+    yaw_rate: float
+    """Yaw rate [rad/s]."""
 
 
 @compiled
@@ -141,41 +138,76 @@ def advance(robot: Robot, state: State, thrust: float, turn: float, substeps: in
 
 @compiled
 def stopping(robot: Robot, state: State) -> Stopping:
-    """The reduced state that belongs to a state: the servo stops the yaw within milliseconds."""
+    """The reduced state that belongs to a state."""
     tau = robot.mass / robot.drag
     lever = robot.offset * state.yaw_rate
     vx = state.vx - lever * math.sin(state.heading)
     vy = state.vy + lever * math.cos(state.heading)
-    deceleration = robot.gear * robot.force_limit / (robot.inertia - robot.mass * robot.offset**2)
-    settle = 0.5 * state.yaw_rate * abs(state.yaw_rate) / deceleration
-    return Stopping(state.x, state.y, state.x + tau * vx, state.y + tau * vy, state.heading + settle)
+    return Stopping(state.x, state.y, state.x + tau * vx, state.y + tau * vy, state.heading, state.yaw_rate)
 
 
 @compiled
-def follow(robot: Robot, at: Stopping, thrust: float, turn: float, seconds: float) -> Stopping:
-    """Advance the reduced model, in closed form for a thrust along the mean heading of the interval.
+def swing(robot: Robot, yaw_rate: float, turn: float, aside: float) -> tuple[float, float, float]:
+    """Step the yaw alone, as `advance` does, with the drag's torque about the centre of mass held.
+
+    The servo is too stiff for its physics step: where it holds a heading, it chatters between its limits and
+    has no authority left, so that torque turns the robot at a rate at which the yaw's own drag balances it.
+
+    Args:
+        robot: the constants.
+        yaw_rate: to start from [rad/s]; 0: the servo chatters.
+        turn: u2 in [-1, 1].
+        aside: velocity of the centre of mass to the left [m/s].
+
+    Returns:
+        How far the heading turns in a control step, and how far on average over it [rad]; the yaw rate after
+        it [rad/s], 0 once the servo only chatters.
+    """
+    h = robot.physics_step
+    k = robot.mass * robot.offset
+    a = robot.mass + h * robot.drag
+    torque = k / a * robot.drag * aside
+    if turn == 0.0 and yaw_rate == 0.0:
+        angle = torque / robot.yaw_drag * h * robot.substeps
+        return angle, 0.5 * angle, 0.0
+    b = robot.inertia + h * robot.yaw_drag - k * k / a
+    angle = 0.0
+    total = 0.0
+    for _ in range(robot.substeps):
+        effort = min(max(turn - robot.gear * yaw_rate, -robot.force_limit), robot.force_limit)
+        yaw_rate += h * (robot.gear * effort - robot.yaw_drag * yaw_rate + torque) / b
+        total += angle + 0.5 * h * yaw_rate
+        angle += h * yaw_rate
+    if turn == 0.0 and abs(yaw_rate) * b < h * robot.gear * robot.force_limit:
+        yaw_rate = 0.0
+    return angle, total / robot.substeps, yaw_rate
+
+
+@compiled
+def follow(robot: Robot, at: Stopping, thrust: float, turn: float) -> Stopping:
+    """Advance the reduced model by a control step, in closed form for a thrust along the mean heading.
 
     Args:
         robot: the constants.
         at: where to start.
         thrust: share of full thrust, in [-1, 1].
-        turn: change of the heading over the interval [rad].
-        seconds: length of the interval [s].
+        turn: u2 in [-1, 1].
 
     Returns:
         The reduced state after it.
     """
+    seconds = robot.physics_step * robot.substeps
     tau = robot.mass / robot.drag
     speed = thrust * robot.gear * robot.force_limit / robot.drag
-    heading = at.heading + 0.5 * turn
-    qx = speed * math.cos(heading)
-    qy = speed * math.sin(heading)
+    aside = (at.zy - at.y) * math.cos(at.heading) - (at.zx - at.x) * math.sin(at.heading)
+    angle, mean, yaw_rate = swing(robot, at.yaw_rate, turn, aside / tau)
+    qx = speed * math.cos(at.heading + mean)
+    qy = speed * math.sin(at.heading + mean)
     fade = math.exp(-seconds / tau)
     x = at.zx + qx * (seconds - tau) + (at.x - at.zx + qx * tau) * fade
     y = at.zy + qy * (seconds - tau) + (at.y - at.zy + qy * tau) * fade
-    after = at.heading + turn
-    if turn != 0.0:
-        # The robot turns about its centre of mass, so the origin swings round.
-        x -= robot.offset * (math.cos(after) - math.cos(at.heading))
-        y -= robot.offset * (math.sin(after) - math.sin(at.heading))
-    return Stopping(x, y, at.zx + qx * seconds, at.zy + qy * seconds, after)
+    after = at.heading + angle
+    # The robot turns about its centre of mass, so the origin swings round.
+    x -= robot.offset * (math.cos(after) - math.cos(at.heading))
+    y -= robot.offset * (math.sin(after) - math.sin(at.heading))
+    return Stopping(x, y, at.zx + qx * seconds, at.zy + qy * seconds, after, yaw_rate)
