@@ -65,7 +65,8 @@ def _batch(
     for t in range(steps):
         seen[t, going] = observation[going]
         observation, r, terminated, truncated, info = env.step(policy(observation.astype(np.float32)))
-        reward[t, going], cost[t, going] = r[going], info["cost"][going]
+        # Where an algorithm constrains something else, the task's own cost stands beside it.
+        reward[t, going], cost[t, going] = r[going], info.get("task_cost", info["cost"])[going]
         going &= ~(terminated | truncated)
         if not going.any():
             break

@@ -72,8 +72,8 @@ class Config:
     critic_l2: float = 0.0
     """Weight of Σ p² over the critics' parameters in their loss (OmniSafe's is 0.001)."""
     nearness: float = 0.25
-    """Distance [m] over which the networks' nearness of a hazard, a feature of each bin of the hazards'
-    lidar beside its reading, falls by a factor e; 0 leaves these features out."""
+    """Distance [m] over which the networks' nearness of a hazard, now and on the way on which the robot would
+    coast to rest (features.Nearness), falls by a factor e; 0 leaves these features out."""
     action_range: tuple[float, ...] | None = None
     """Largest size of each action that the policy uses, which is also its unit. Not set: 0.05 for the point
     robot's thrust, which saturates there, and 1 for its turning; the task's bounds elsewhere."""
@@ -100,12 +100,18 @@ class Config:
     """lagnet-foresight: Adam's step size for the regression of C̄_ξ."""
     foresight_passes: int = 5
     """lagnet-foresight: passes of that regression over an epoch (at most `passes`)."""
+    statewise: bool = True
+    """lagnet-foresight: whether λ differs between states; if not, each takes the mean (an ablation)."""
     scale_init: float = 30.0
     """lagnet-foresight: the value the scale β starts at; λ_ξ(s) = β C̄_ξ(s)."""
     scale_gain: float = 0.05
     """lagnet-foresight: log β moves by this much an epoch for each relative excess of the cost over d."""
     scale_step: float = 0.05
     """lagnet-foresight: largest change of log β in an epoch."""
+    limit_slack: float = 6.0
+    """lagnet-foresight: how many times the cost limit β aims at first; it tightens geometrically."""
+    limit_settled: float = 0.6
+    """lagnet-foresight: share of the run after which β aims at the cost limit itself."""
     limit_share: float = 1.0
     """lagnet-foresight: share of the cost limit that β aims at."""
 
@@ -175,7 +181,7 @@ _POSITIVE = (
     "minibatch",
     "learning_rate", "critic_learning_rate", "clip", "kl_stop", "gradient_clip",
     "multiplier_learning_rate", "multiplier_passes", "checkpoint_every", "foresight_init",
-    "foresight_learning_rate", "foresight_passes", "scale_init", "scale_step", "limit_share",
+    "foresight_learning_rate", "foresight_passes", "scale_init", "scale_step", "limit_slack", "limit_share",
     "dual_learning_rate", "pid_delay",
     "ipo_sharpness", "ipo_kappa", "trust_kl", "cg_iterations", "fisher_every",
 )  # fmt: skip
@@ -183,7 +189,7 @@ _NOT_NEGATIVE = (
     "cost_limit", "seed", "entropy", "nearness", "saturation", "critic_l2", "multiplier_init", "scale_gain",
     "dual_init", "pid_kp", "pid_ki", "pid_kd", "damping",
 )  # fmt: skip
-_FRACTION = ("discount", "cost_discount", "gae", "foresight", "pid_smoothing")
+_FRACTION = ("discount", "cost_discount", "gae", "foresight", "limit_settled", "pid_smoothing")
 
 
 def check(config: Config) -> None:

@@ -21,7 +21,7 @@ from models import BundleError, Manifest, ObservationBlock, write_bundle
 from pointgoal.observation import HAZARD_RADIUS, layout
 from trainer import checkpoint, onnx_graph
 from trainer.actions import ActionRange
-from trainer.algorithms import ALGORITHMS
+from trainer.algorithms import ALGORITHMS, prepare_environments
 from trainer.algorithms.base import Algorithm
 from trainer.calibration import Threshold, calibrate
 from trainer.closed_loop import Episodes, episodes
@@ -174,7 +174,7 @@ def play(run: TrainedRun, count: int, threads: int) -> Episodes:
     act = run.policy()
     features = run.learner.features
     settings = dataclasses.replace(run.config, num_envs=min(count, ENVIRONMENTS), threads=threads)
-    with closing(make_environments(settings)) as env:
+    with closing(prepare_environments(settings.algorithm, make_environments(settings), 1)) as env:
         return episodes(
             env,
             lambda observation: run.range.sent(act(features(observation))),

@@ -9,8 +9,9 @@ import numpy.typing as npt
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
+from pointgoal.observation import BIN_WIDTH, LIDAR_BINS, LIDAR_RANGE
 from trainer.actions import ActionRange
-from trainer.features import GAIN, Features
+from trainer.features import COASTING, GAIN, TINY, Features, Nearness
 from trainer.networks import HIDDEN, Shape
 from trainer.normaliser import CLIP
 
@@ -32,30 +33,73 @@ class _Builder:
         self.constants.append(numpy_helper.from_array(np.asarray(value, kind), name))
         return name
 
-    def node(self, operator: str, *others: str, output: str | None = None) -> None:
+    def node(self, operator: str, *others: str, output: str | None = None, **attributes: int) -> None:
         result = output or f"t{len(self.nodes)}"
-        self.nodes.append(helper.make_node(operator, [self.last, *others], [result]))
+        node = helper.make_node(operator, [self.last, *others], [result])
+        node.attribute.extend(helper.make_attribute(name, value) for name, value in attributes.items())
+        self.nodes.append(node)
         self.last = result
+
+    def columns(self, where: slice) -> str:
+        """Numbers of the observation [batch, k]."""
+        self.last = "observation"
+        self.node("Slice", *(self.constant([k], np.int64) for k in (where.start, where.stop, 1)))
+        return self.last
+
+    def rolled(self, bins: str, shift: int) -> str:
+        """Of each bin, the number of the bin `shift` before it."""
+        self.last = bins
+        order = (np.arange(LIDAR_BINS) - shift) % LIDAR_BINS
+        self.node("Gather", self.constant(order, np.int64), axis=1)
+        return self.last
+
+    def chain(self, start: str, *steps: tuple[str, ...]) -> str:
+        """Nodes one after the other, each an operator and its further inputs; the last one's output."""
+        self.last = start
+        for operator, *others in steps:
+            self.node(operator, *others)
+        return self.last
+
+    def nearness(self, near: Nearness) -> str:
+        """features.Nearness, operation by operation [batch, 2 · bins]."""
+        zero, half, one = self.constant(0.0), self.constant(0.5), self.constant(1.0)
+        reading = self.columns(near.readings)
+        distance = self.chain(reading, ("Neg",), ("Add", one), ("Mul", self.constant(LIDAR_RANGE)))
+        divisor = self.chain(reading, ("Max", self.constant(TINY)))
+        upper = self.chain(self.rolled(reading, -1), ("Div", divisor), ("Min", one))
+        lower = self.chain(self.rolled(reading, 1), ("Div", divisor), ("Neg",), ("Add", one), ("Max", zero))
+        bins = self.constant(np.arange(LIDAR_BINS))
+        bearing = self.chain(
+            lower, ("Add", upper), ("Mul", half), ("Add", bins), ("Mul", self.constant(BIN_WIDTH))
+        )
+        x = self.chain(bearing, ("Cos",), ("Mul", distance))
+        y = self.chain(bearing, ("Sin",), ("Mul", distance))
+        start = near.velocity.start
+        time = self.constant(COASTING)
+        dx, dy = (self.chain(self.columns(slice(k, k + 1)), ("Mul", time)) for k in (start, start + 1))
+        square = self.chain(dy, ("Mul", dy))
+        square = self.chain(dx, ("Mul", dx), ("Add", square), ("Add", self.constant(TINY)))
+        along = self.chain(y, ("Mul", dy))
+        share = self.chain(x, ("Mul", dx), ("Add", along), ("Div", square), ("Max", zero), ("Min", one))
+        ex = self.chain(share, ("Mul", dx), ("Sub", x))
+        ey = self.chain(share, ("Mul", dy), ("Sub", y))
+        aside = self.chain(ey, ("Mul", ey))
+        passing = self.chain(ex, ("Mul", ex), ("Add", aside), ("Sqrt",))
+        self.last = distance
+        self.node("Concat", passing, axis=1)
+        rate, gain = self.constant(-1 / near.length), self.constant(GAIN)
+        return self.chain(self.last, ("Mul", rate), ("Exp",), ("Mul", gain))
 
     def features(self, features: Features) -> None:
         """The networks' inputs, see features.Features."""
         mean, inverse = features.normaliser.scale()
-        near = features.nearness
-        others: list[str] = []
-        if near is not None:
-            self.node("Slice", *(self.constant([k], np.int64) for k in (near.start, near.stop, 1)))
-            self.node("Sub", self.constant(1.0))
-            self.node("Mul", self.constant(near.rate))
-            self.node("Exp")
-            self.node("Mul", self.constant(GAIN))
-            others = [self.last]
-            self.last = "observation"
+        others = [] if features.nearness is None else [self.nearness(features.nearness)]
+        self.last = "observation"
         self.node("Sub", self.constant(mean))
         self.node("Mul", self.constant(inverse))
         self.node("Clip", self.constant(-CLIP), self.constant(CLIP))
         if others:
-            self.node("Concat", *others)
-            self.nodes[-1].attribute.append(helper.make_attribute("axis", 1))
+            self.node("Concat", *others, axis=1)
 
     def network(self, theta: Floats, shape: Shape, features: Features) -> None:
         """Runs a network on the observation's features."""
@@ -128,8 +172,7 @@ def multiplier_graph(theta: Floats, shape: Shape, features: Features, scale: flo
 def constant_graph(inputs: int, value: float) -> bytes:
     """Observation [batch, n] → multiplier [batch]: the same value in every state."""
     builder = _Builder()
-    builder.node("ReduceSum", builder.constant([1], np.int64))
-    builder.nodes[-1].attribute.append(helper.make_attribute("keepdims", 0))
+    builder.node("ReduceSum", builder.constant([1], np.int64), keepdims=0)
     builder.node("Mul", builder.constant(0.0))
     builder.node("Add", builder.constant(value), output="multiplier")
     return builder.model(inputs, "multiplier", ["batch"])

@@ -19,7 +19,7 @@ from trainer.errors import CheckpointError, ConfigError, NonFiniteError
 from trainer.train import Run, load_config, train
 
 ALGORITHMS = ("ppo", "ppo-lag", "cppo-pid", "scpo", "lagnet", "lagnet-foresight")
-SHORT = ["--task", "PointGoal0-v0", "--total-steps", "8000", "--num-envs", "10", "--epoch-steps", "500",
+SHORT = ["--task", "PointGoal0-v0", "--total-steps", "30000", "--num-envs", "10", "--epoch-steps", "500",
          "--minibatch", "250", "--passes", "1", "--threads", "1", "--checkpoint-every", "2"]  # fmt: skip
 
 
@@ -86,12 +86,12 @@ def wait_for(condition, process):
         time.sleep(0.002)
 
 
-def test_kill_at_random_moments(whole_run, tmp_path):
+def test_kill_at_ten_random_moments(whole_run, tmp_path):
     folder = tmp_path / "run"
     rng = random.Random(0)
     process = start("--out", str(folder), *SHORT, "--no-tensorboard")
     wait_for((folder / checkpoint.FILE).exists, process)
-    for _ in range(2):
+    for _ in range(10):
         table = folder / "progress.csv"
         seen = len(table.read_bytes()) if table.exists() else 0
         wait_for(lambda: table.exists() and len(table.read_bytes()) > seen, process)  # noqa: B023
@@ -118,7 +118,7 @@ def test_ctrl_c_saves_and_says_how_to_go_on(whole_run, tmp_path):
     assert process.returncode == 130
     assert f"lagnet-train --resume {folder}" in message
     done = checkpoint.read(folder)[1]["epoch"]
-    assert 0 < done < 16
+    assert 0 < done < 60
     process = start("--resume", str(folder))
     assert process.wait() == 0
     assert (folder / "progress.csv").read_bytes() == whole_run

@@ -4,6 +4,9 @@ Eq. 15 is linear in λ: its optimum in each state is 0 or infinity. With a quadr
 max E[λ (C̄ − w) − κ λ² / 2], the optimum is bounded, λ(s) = [C̄(s) − w]₊ / κ. Here C̄(s) is the discounted cost
 of the next moments, regressed by a network, so that λ rises on the approach and not only inside a hazard; and
 the one scale β = 1/κ is moved until the episode cost meets its limit. λ_ξ(s) = β C̄_ξ(s).
+
+A policy that is held to a strict limit before it can drive learns to stand still, and goes on to give up
+wherever a hazard lies in its way. So the limit starts loose and tightens over the first part of the run.
 """
 
 import math
@@ -15,6 +18,7 @@ from trainer.advantage import gae, successor_values
 from trainer.algorithms.base import Algorithm
 from trainer.algorithms.lagnet import statewise_update
 from trainer.algorithms.multiplier import MultiplierNetwork
+from trainer.config import Config
 from trainer.dual import Numbers, number
 from trainer.learner import Batch, Learner
 from trainer.rollout import Figures
@@ -31,22 +35,25 @@ class LagnetForesight(Algorithm):
 
     def update(self, batch: Batch, figures: Figures) -> dict[str, float]:
         """One update on one epoch, see Algorithm.update."""
+        config = self.config
         self.network.scale = next_scale(
             self.network.scale,
             self.cost_now(figures),
-            self.config.cost_limit * self.config.limit_share,
-            self.config.scale_gain,
-            self.config.scale_step,
+            config.limit_share * limit_now(config, self.learner.progress),
+            config.scale_gain,
+            config.scale_step,
         )
         loss = self._regress(batch)
         with torch.no_grad():
             multiplier = self.network(batch.observation)
+        if not config.statewise:
+            multiplier = multiplier.mean().expand_as(multiplier)
         return {
             "multiplier": float(multiplier.mean()),
             "multiplier_max": float(multiplier.max()),
             "scale": self.network.scale,
             "multiplier_loss": loss,
-        } | statewise_update(self.learner, batch, multiplier, self.config.rescale or "state")
+        } | statewise_update(self.learner, batch, multiplier, config.rescale or "state")
 
     def cost_now(self, figures: Figures) -> float:
         """What an episode of the latest epoch's steps costs: without the delay of finished episodes."""
@@ -85,6 +92,12 @@ class LagnetForesight(Algorithm):
     def load_state(self, state: Numbers) -> None:
         """Takes on the scale."""
         self.network.scale = number(state["scale"])
+
+
+def limit_now(config: Config, progress: float) -> float:
+    """The limit that counts after a share of the run [0, 1): from limit_slack · d geometrically down to d."""
+    left = max(0.0, 1 - progress / config.limit_settled) if config.limit_settled else 0.0
+    return float(config.cost_limit * config.limit_slack**left)
 
 
 def next_scale(scale: float, cost: float, target: float, gain: float, step: float) -> float:
