@@ -19,7 +19,7 @@ import tyro
 from numpy.typing import NDArray
 
 from filter import BarrierFilter, FilterConfig, FilterMemory
-from pointgoal.observation import BIN_WIDTH, LIDAR_BINS, LIDAR_RANGE, layout
+from pointgoal.observation import BIN_WIDTH, HAZARD_RADIUS, LIDAR_BINS, LIDAR_RANGE, layout
 
 FloatArray = NDArray[np.float64]
 Policy = Callable[[FloatArray, FloatArray, np.random.Generator], FloatArray]
@@ -253,11 +253,11 @@ def _run(
         observation, reward, terminated, truncated, info = env.step(action)
         returns[alive] += reward[alive]
         costs[alive] += info["cost"][alive]
-        violations[alive] += _hazard_violations(info, alive, level, env)
-        if level > 0:
-            distance = np.linalg.norm(env.hazards_in_body_frame(), axis=2)
-            done = terminated | truncated
-            least = min(least, float(distance[alive & ~done].min(initial=np.inf)) - 0.2)
+        edge = _nearest_edge(observation, info)
+        # At level 2 vases cost as well, and a step with a cost need not be one in a hazard.
+        inside = edge < 0.0 if level == 2 else info["cost"] > 0.0
+        violations[alive] += inside[alive]
+        least = min(least, float(edge[alive].min(initial=np.inf)))
         alive &= ~(terminated | truncated)
         if not alive.any():
             break
@@ -266,14 +266,18 @@ def _run(
     return Outcome(returns, costs, violations, changed / steps, fallen / steps, least, spent / steps)
 
 
-def _hazard_violations(
-    info: dict[str, Any], alive: NDArray[np.bool_], level: int, env: Any
-) -> NDArray[np.int64]:
-    """Steps with a cost; at level 2, where vases cost as well, steps inside a hazard."""
-    if level == 2:
-        inside = np.linalg.norm(env.hazards_in_body_frame(), axis=2).min(axis=1) < 0.2
-        return np.asarray(inside[alive], dtype=np.int64)
-    return np.asarray(info["cost"][alive] > 0.0, dtype=np.int64)
+def _nearest_edge(observation: FloatArray, info: dict[str, Any]) -> FloatArray:
+    """Distance (N,) from the nearest hazard's edge after a step [m], from the true scans.
+
+    Where an episode ended, the positions and the observation are the next one's; the last one's scan is kept.
+    """
+    seen = observation
+    if "final_obs" in info:
+        seen = np.where(info["_final_obs"][:, None], info["final_obs"], observation)
+    if seen.shape[1] == layout(0).size:
+        return np.full(len(seen), np.inf)
+    strongest = seen[:, layout(1).slice("hazards_lidar")].max(axis=1)
+    return np.asarray(LIDAR_RANGE * (1.0 - strongest) - HAZARD_RADIUS)
 
 
 POLICIES: dict[str, Policy] = {
@@ -304,6 +308,17 @@ def _line(name: str, outcome: Outcome) -> str:
     )
 
 
+Table = Literal["plain", "memoryless", "off", "noise", "margin", "level2", "level0"]
+MARGINS = {
+    "margin 3 mm": FilterConfig(margin=0.003),
+    "margin 2 cm": FilterConfig(margin=0.02),
+    "margin 4 cm": FilterConfig(margin=0.04),
+    "ready for noise": NOISY,
+    "ready for a robot off": ROBUST,
+}
+"""What is asked of the filter though nothing is off: how the return pays for it."""
+
+
 @dataclass
 class Arguments:
     """What to run."""
@@ -316,14 +331,10 @@ class Arguments:
     """Which policies to run."""
     sources: tuple[Literal["given", "lidar"], ...] = SOURCES
     """Where the filter has the hazards from."""
-    tables: tuple[Literal["plain", "memoryless", "off", "noise", "level2"], ...] = (
-        "plain",
-        "memoryless",
-        "off",
-        "noise",
-        "level2",
-    )
+    tables: tuple[Table, ...] = ("plain", "memoryless", "off", "noise", "margin", "level2", "level0")
     """Which tables to print."""
+    seed: int = 1_000_000
+    """Seed of the first episode; tune on others."""
 
 
 @dataclass(frozen=True)
@@ -347,11 +358,22 @@ def _plain(policies: dict[str, Policy], sources: Sequence[Literal["given", "lida
 
 
 def _table(
-    table: str, policies: dict[str, Policy], sources: Sequence[Literal["given", "lidar"]]
+    table: Table, policies: dict[str, Policy], sources: Sequence[Literal["given", "lidar"]]
 ) -> Iterator[Line]:
     """The lines of one table."""
     if table == "plain":
         yield from _plain(policies, sources)
+        return
+    if table == "level0":
+        # No hazards: policies that look for them, or were trained to see them, have nothing to go by.
+        for name in ("seeker", "random"):
+            yield Line(f"{name}, no filter, level0", POLICIES[name], None, "given", level=0)
+            yield Line(f"{name}, level0", POLICIES[name], PLAIN, "given", level=0)
+        return
+    if table == "margin":
+        first = next(iter(policies))
+        for source, (title, config) in itertools.product(sources, MARGINS.items()):
+            yield Line(f"{first}, {source}, {title}", policies[first], config, source)
         return
     for (name, policy), source in itertools.product(policies.items(), sources):
         title = f"{name}, {source}, {table}"
@@ -385,6 +407,7 @@ def main() -> None:
                 arguments.episodes,
                 line.level,
                 line.off,
+                arguments.seed,
                 with_memory=line.memory,
             )
             print(_line(line.name, outcome), flush=True)

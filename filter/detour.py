@@ -33,6 +33,12 @@ _TURN_HEADING = 0.1
 """Length that it costs to turn by a radian [m]."""
 _ALONG = 0.7
 """Least cosine of the angle to the way round of a thrust that counts as driving round."""
+_SAME_END = 0.5
+"""Cosine of the heading's error that a robot on the move puts up with before its other end leads."""
+_ON_THE_MOVE = 0.1
+"""Way ahead to the stop point from which on it puts up with all of that [m]."""
+_GAIN = 0.7
+"""Share of the heading's error that is turned away in a control step."""
 _TRIES = 5
 """Most discs that one hop is moved aside for."""
 
@@ -137,7 +143,8 @@ def _change(x: float, y: float, zx: float, zy: float, way: int, side: int, stead
     """What a first leg to (x, y) costs beyond its length [m]: turning motion, heading, and mind."""
     leg = math.hypot(x, y)
     cost = _TURN_MOTION * (math.hypot(zx, zy) - (zx * x + zy * y) / leg)
-    cost += _TURN_HEADING * abs(math.atan2(y, x))
+    # Either end may lead.
+    cost += _TURN_HEADING * math.atan2(abs(y), abs(x))
     if side == -way:
         cost += steadiness
     return cost
@@ -232,10 +239,14 @@ def steer(
             ux -= push * discs[i, 0] / away
             uy -= push * discs[i, 1] / away
     error = math.atan2(uy * settings.pursuit - at.zy, ux * settings.pursuit - at.zx) - at.heading
-    error = math.atan2(math.sin(error), math.cos(error))
-    turn = steered(settings.robot, 0.7 * error)
+    # It drives as well backwards: the end that is nearer to the way leads, if the other does not already.
+    ahead = (at.zx - at.x) * math.cos(at.heading) + (at.zy - at.y) * math.sin(at.heading)
+    end = 1.0
+    if math.cos(error) + _SAME_END * min(max(ahead / _ON_THE_MOVE, -1.0), 1.0) < 0.0:
+        end = -1.0
+    error = math.atan2(end * math.sin(error), end * math.cos(error))
     thrust = min(max(settings.eagerness * math.cos(error), -1.0), 1.0)
-    return thrust, turn
+    return end * thrust, steered(settings.robot, _GAIN * error)
 
 
 @compiled

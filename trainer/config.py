@@ -51,7 +51,7 @@ class Config:
     """Discount γ of the reward, a control step."""
     cost_discount: float = 0.99
     """Discount γ of the cost, a control step."""
-    gae: float = 0.9
+    gae: float = 0.95
     """λ of generalised advantage estimation, for the reward and the cost, a decision."""
     passes: int = 10
     """Passes over an epoch's data in one update, at most."""
@@ -65,7 +65,7 @@ class Config:
     """ε of PPO's clipped surrogate."""
     kl_stop: float = 0.02
     """An update ends early once a pass moved the policy by more than this mean KL divergence."""
-    entropy: float = 0.0
+    entropy: float = 0.002
     """Weight of the entropy bonus in PPO's objective."""
     gradient_clip: float = 40.0
     """Largest norm of a gradient, for the actor, the critics and the multiplier network each."""
@@ -79,12 +79,15 @@ class Config:
     robot's thrust, which saturates there, and 1 for its turning; the task's bounds elsewhere."""
     saturation: float = 0.05
     """Weight of the squared excess of the policy's mean over the action range, which keeps it exploring."""
-    initial_log_std: float = -0.5
+    initial_log_std: float = 0.0
     """Initial log standard deviation of the policy's actions."""
 
     rescale: Literal["mean", "state"] | None = None
     """lagnet, lagnet-foresight: divide eq. 14 by 1 + mean λ, or each state's term by 1 + λ_ξ(s) σ_c. Not set:
     "mean" for lagnet, "state" for lagnet-foresight."""
+    limit_share: float = 1.0
+    """lagnet, lagnet-foresight: share of the cost limit that the multiplier aims at; below 1, a run whose cost
+    still swings about its aim ends within the limit."""
     multiplier_init: float = 20.0
     """lagnet: the value λ_ξ(s) starts at in every state (the paper's is about 20)."""
     multiplier_learning_rate: float = 3e-4
@@ -108,12 +111,6 @@ class Config:
     """lagnet-foresight: log β moves by this much an epoch for each relative excess of the cost over d."""
     scale_step: float = 0.05
     """lagnet-foresight: largest change of log β in an epoch."""
-    limit_slack: float = 6.0
-    """lagnet-foresight: how many times the cost limit β aims at first; it tightens geometrically."""
-    limit_settled: float = 0.6
-    """lagnet-foresight: share of the run after which β aims at the cost limit itself."""
-    limit_share: float = 1.0
-    """lagnet-foresight: share of the cost limit that β aims at."""
 
     dual_init: float = 0.001
     """ppo-lag, trpo-lag, cppo-pid: the value the multiplier (for cppo-pid its integral) starts at."""
@@ -181,7 +178,7 @@ _POSITIVE = (
     "minibatch",
     "learning_rate", "critic_learning_rate", "clip", "kl_stop", "gradient_clip",
     "multiplier_learning_rate", "multiplier_passes", "checkpoint_every", "foresight_init",
-    "foresight_learning_rate", "foresight_passes", "scale_init", "scale_step", "limit_slack", "limit_share",
+    "foresight_learning_rate", "foresight_passes", "scale_init", "scale_step", "limit_share",
     "dual_learning_rate", "pid_delay",
     "ipo_sharpness", "ipo_kappa", "trust_kl", "cg_iterations", "fisher_every",
 )  # fmt: skip
@@ -189,7 +186,7 @@ _NOT_NEGATIVE = (
     "cost_limit", "seed", "entropy", "nearness", "saturation", "critic_l2", "multiplier_init", "scale_gain",
     "dual_init", "pid_kp", "pid_ki", "pid_kd", "damping",
 )  # fmt: skip
-_FRACTION = ("discount", "cost_discount", "gae", "foresight", "limit_settled", "pid_smoothing")
+_FRACTION = ("discount", "cost_discount", "gae", "foresight", "pid_smoothing")
 
 
 def check(config: Config) -> None:

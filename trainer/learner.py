@@ -66,7 +66,6 @@ class Learner:
         actor_shape: layer sizes of the actor's network.
         critic_shape: layer sizes of the critics, and of a multiplier network.
         edge: where the policy's draws saturate [a].
-        progress: share of the run that is done [0, 1).
     """
 
     def __init__(
@@ -75,7 +74,6 @@ class Learner:
         self.config = config
         self.edge = torch.from_numpy(actions.edge)
         self.rng = rng
-        self.progress = 0.0
         self.features = Features(observations, nearness(config))
         self.actor_shape = Shape(self.features.size, len(actions.unit))
         self.critic_shape = Shape(self.features.size, 1)
@@ -104,8 +102,7 @@ class Learner:
         optimiser.step()
 
     def start_epoch(self, progress: float) -> None:
-        """Takes note of the share of the run that is done [0, 1), and sets the actor's step size for it."""
-        self.progress = progress
+        """Sets the actor's step size for the share of the run that is done [0, 1)."""
         self.optimisers["actor"].param_groups[0]["lr"] = self.config.learning_rate * (1 - progress)
 
     def policy(self, observation: Tensor) -> tuple[Tensor, Tensor]:

@@ -66,7 +66,7 @@ class Lagnet(Algorithm):
 
     def _ascend(self, batch: Batch) -> float:
         """Passes of minibatch ascent on eq. 15; returns the mean loss of the last one."""
-        limit = self.config.state_limit
+        limit = self.config.limit_share * self.config.state_limit
 
         def loss(block: slice) -> Tensor:
             return multiplier_loss(self.network(batch.observation[block]), batch.cost[block], limit)

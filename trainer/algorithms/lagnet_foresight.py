@@ -4,9 +4,6 @@ Eq. 15 is linear in λ: its optimum in each state is 0 or infinity. With a quadr
 max E[λ (C̄ − w) − κ λ² / 2], the optimum is bounded, λ(s) = [C̄(s) − w]₊ / κ. Here C̄(s) is the discounted cost
 of the next moments, regressed by a network, so that λ rises on the approach and not only inside a hazard; and
 the one scale β = 1/κ is moved until the episode cost meets its limit. λ_ξ(s) = β C̄_ξ(s).
-
-A policy that is held to a strict limit before it can drive learns to stand still, and goes on to give up
-wherever a hazard lies in its way. So the limit starts loose and tightens over the first part of the run.
 """
 
 import math
@@ -18,7 +15,6 @@ from trainer.advantage import gae, successor_values
 from trainer.algorithms.base import Algorithm
 from trainer.algorithms.lagnet import statewise_update
 from trainer.algorithms.multiplier import MultiplierNetwork
-from trainer.config import Config
 from trainer.dual import Numbers, number
 from trainer.learner import Batch, Learner
 from trainer.rollout import Figures
@@ -39,7 +35,7 @@ class LagnetForesight(Algorithm):
         self.network.scale = next_scale(
             self.network.scale,
             self.cost_now(figures),
-            config.limit_share * limit_now(config, self.learner.progress),
+            config.limit_share * config.cost_limit,
             config.scale_gain,
             config.scale_step,
         )
@@ -92,12 +88,6 @@ class LagnetForesight(Algorithm):
     def load_state(self, state: Numbers) -> None:
         """Takes on the scale."""
         self.network.scale = number(state["scale"])
-
-
-def limit_now(config: Config, progress: float) -> float:
-    """The limit that counts after a share of the run [0, 1): from limit_slack · d geometrically down to d."""
-    left = max(0.0, 1 - progress / config.limit_settled) if config.limit_settled else 0.0
-    return float(config.cost_limit * config.limit_slack**left)
 
 
 def next_scale(scale: float, cost: float, target: float, gain: float, step: float) -> float:
