@@ -136,6 +136,18 @@ def test_a_robot_gets_past_what_stands_in_its_way_without_memory(robot_filter, h
     pytest.fail(f"stuck at {at[:2]}")
 
 
+@pytest.mark.parametrize("front", [1.0, -1.0])
+def test_either_end_of_the_robot_may_lead_the_way_round(robot_filter, hand, front):
+    # The same scene ahead and astern, and a policy that would rather stay.
+    hazards, goal = front * np.array([[0.6, 0.02]]), front * np.array([2.2, 0.0])
+    for ahead in (0.0, 0.5):
+        observation = hand.observe(hazards, (front * ahead, 0.0), 0.0, goal)[None]
+        result = robot_filter.filter(observation, np.zeros((1, 2)), hazards[None])
+        assert result.row[0] == Row.DETOUR
+        assert front * result.action[0, 0] > 0.03
+        assert 0.0 < abs(result.action[0, 1]) <= 1.0
+
+
 def test_without_a_goal_the_robot_stops_in_front(robot_filter, hand):
     hazard = np.array([0.9, 0.0])
     at = np.zeros(6)
