@@ -40,7 +40,7 @@ class Config:
     """Environments stepped side by side."""
     action_repeat: int = 5
     """Control steps that a decision is held for during training; the exported policy decides every step."""
-    epoch_steps: int = 20_000
+    epoch_steps: int = 10_000
     """Control steps between two updates, over all environments; a multiple of num_envs · action_repeat."""
     episode_steps: int = 1000
     """Steps of a full episode [steps]; turns the cost limit into the state-wise limit."""
@@ -49,8 +49,8 @@ class Config:
 
     discount: float = 0.99
     """Discount γ of the reward, a control step."""
-    cost_discount: float = 0.99
-    """Discount γ of the cost, a control step."""
+    cost_discount: float = 0.975
+    """Discount γ of the cost, a control step (0.975: 0.8 s, about what the robot takes to stop)."""
     gae: float = 0.95
     """λ of generalised advantage estimation, for the reward and the cost, a decision."""
     passes: int = 10
@@ -66,7 +66,7 @@ class Config:
     kl_stop: float = 0.02
     """An update ends early once a pass moved the policy by more than this mean KL divergence."""
     entropy: float = 0.002
-    """Weight of the entropy bonus in PPO's objective."""
+    """Weight of the entropy bonus in PPO's objective; decays linearly to zero over the run."""
     gradient_clip: float = 40.0
     """Largest norm of a gradient, for the actor, the critics and the multiplier network each."""
     critic_l2: float = 0.0
@@ -109,7 +109,7 @@ class Config:
     """lagnet-foresight: the value the scale β starts at; λ_ξ(s) = β C̄_ξ(s)."""
     scale_gain: float = 0.05
     """lagnet-foresight: log β moves by this much an epoch for each relative excess of the cost over d."""
-    scale_step: float = 0.05
+    scale_step: float = 0.025
     """lagnet-foresight: largest change of log β in an epoch."""
 
     dual_init: float = 0.001

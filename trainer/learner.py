@@ -66,6 +66,7 @@ class Learner:
         actor_shape: layer sizes of the actor's network.
         critic_shape: layer sizes of the critics, and of a multiplier network.
         edge: where the policy's draws saturate [a].
+        entropy: weight of the entropy bonus in this epoch.
     """
 
     def __init__(
@@ -74,6 +75,7 @@ class Learner:
         self.config = config
         self.edge = torch.from_numpy(actions.edge)
         self.rng = rng
+        self.entropy = config.entropy
         self.features = Features(observations, nearness(config))
         self.actor_shape = Shape(self.features.size, len(actions.unit))
         self.critic_shape = Shape(self.features.size, 1)
@@ -102,7 +104,8 @@ class Learner:
         optimiser.step()
 
     def start_epoch(self, progress: float) -> None:
-        """Sets the actor's step size for the share of the run that is done [0, 1)."""
+        """Sets the actor's step size and entropy bonus for the share of the run that is done [0, 1)."""
+        self.entropy = self.config.entropy * (1 - progress)
         self.optimisers["actor"].param_groups[0]["lr"] = self.config.learning_rate * (1 - progress)
 
     def policy(self, observation: Tensor) -> tuple[Tensor, Tensor]:

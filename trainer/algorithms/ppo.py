@@ -65,7 +65,7 @@ def improve_policy(learner: Learner, batch: Batch, policy_loss: PolicyLoss) -> d
             mean, log_std = learner.policy(batch.observation[block])
             log_prob = log_probability(mean, log_std, batch.action[block])
             ratio = (log_prob - batch.log_prob[block]).exp()
-            loss = policy_loss(ratio, block) - config.entropy * log_std.sum()
+            loss = policy_loss(ratio, block) - learner.entropy * log_std.sum()
             if config.saturation:
                 loss = loss + config.saturation * saturation_loss(mean, learner.edge)
             (gradient,) = torch.autograd.grad(loss, learner.actor)
