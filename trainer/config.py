@@ -49,8 +49,8 @@ class Config:
 
     discount: float = 0.99
     """Discount γ of the reward, a control step."""
-    cost_discount: float = 0.975
-    """Discount γ of the cost, a control step (0.975: 0.8 s, about what the robot takes to stop)."""
+    cost_discount: float = 0.99
+    """Discount γ of the cost, a control step."""
     gae: float = 0.95
     """λ of generalised advantage estimation, for the reward and the cost, a decision."""
     passes: int = 10
@@ -81,13 +81,16 @@ class Config:
     """Weight of the squared excess of the policy's mean over the action range, which keeps it exploring."""
     initial_log_std: float = 0.0
     """Initial log standard deviation of the policy's actions."""
+    final_log_std: float = -1.6
+    """Largest log standard deviation at the end of the run; the bound falls linearly from the initial one.
+    What is learnt with much noise need not hold without: a robot may stay where only noise would move it."""
 
     rescale: Literal["mean", "state"] | None = None
     """lagnet, lagnet-foresight: divide eq. 14 by 1 + mean λ, or each state's term by 1 + λ_ξ(s) σ_c. Not set:
     "mean" for lagnet, "state" for lagnet-foresight."""
     limit_share: float = 1.0
-    """lagnet, lagnet-foresight: share of the cost limit that the multiplier aims at; below 1, a run whose cost
-    still swings about its aim ends within the limit."""
+    """lagnet, lagnet-foresight: share of the cost limit that the multiplier aims at; below 1, a run whose
+    cost still swings about its aim ends within the limit."""
     multiplier_init: float = 20.0
     """lagnet: the value λ_ξ(s) starts at in every state (the paper's is about 20)."""
     multiplier_learning_rate: float = 3e-4
@@ -107,7 +110,7 @@ class Config:
     """lagnet-foresight: whether λ differs between states; if not, each takes the mean (an ablation)."""
     scale_init: float = 30.0
     """lagnet-foresight: the value the scale β starts at; λ_ξ(s) = β C̄_ξ(s)."""
-    scale_gain: float = 0.05
+    scale_gain: float = 0.025
     """lagnet-foresight: log β moves by this much an epoch for each relative excess of the cost over d."""
     scale_step: float = 0.025
     """lagnet-foresight: largest change of log β in an epoch."""

@@ -190,7 +190,9 @@ def test_lagnet_foresight_regresses_the_cost_ahead_and_scales_it():
     np.testing.assert_allclose(rule.targets(batch), want.reshape(-1)[batch.order], atol=1e-5)
 
     logged = rule.update(batch, figures)
-    assert logged["scale"] == pytest.approx(learner.config.scale_init * np.exp(0.05))  # 10 × mean cost > d
+    assert logged["scale"] == pytest.approx(
+        learner.config.scale_init * np.exp(learner.config.scale_step)
+    )  # 10 × mean cost > d
     x = batch.observation[:3]
     torch.testing.assert_close(rule.network(x), logged["scale"] * rule.network.raw(x))
 
