@@ -28,7 +28,7 @@ SETTINGS = {
 
 
 def learn(algorithm, tmp_path, tiny_task):
-    settings = {"cost_limit": LIMIT} | SETTINGS[algorithm]
+    settings = {"cost_limit": LIMIT, "initial_log_std": -0.5, "entropy": 0.0} | SETTINGS[algorithm]
     config = Config(
         algorithm=algorithm, task="Tiny", action_repeat=1,
         out=tmp_path / "run", episode_steps=20, num_envs=20, epoch_steps=1000,
