@@ -44,7 +44,7 @@ class FilterConfig:
     """Weight of a change of thrust in the QP, against 1 for a change of turn: prefer turning to braking."""
     lookahead: float = 1.2
     """A hazard nearer than this on the straight way to the goal is driven round [m]; 0 turns that off."""
-    clearance: float = 0.05
+    clearance: float = 0.06
     """Distance that the way round keeps from what the certificate asks for [m]."""
     pursuit: float = 0.65
     """How far ahead of the robot, along the way round, the stop point is steered to [m]."""

@@ -29,7 +29,7 @@ _HOP = math.tan(math.radians(20.0))
 """The path goes past each tangent point by this share of the radius: round a disc in hops of 40 degrees."""
 _TURN_MOTION = 0.5
 """Length that it costs to give up a metre of the way to the stop point."""
-_TURN_HEADING = 0.1
+_TURN_HEADING = 0.4
 """Length that it costs to turn by a radian [m]."""
 _ALONG = 0.7
 """Least cosine of the angle to the way round of a thrust that counts as driving round."""

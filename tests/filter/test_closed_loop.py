@@ -137,7 +137,7 @@ def test_what_is_remembered_stays_clear_of_the_true_hazards_for_ever(source, pol
         memory = result.memory
         observation, *_ = env.step(result.action)
     env.close()
-    assert source == "given" or continued > 0
+    assert continued > 0 or margin > MODEL_ERROR
 
 
 def test_nothing_in_reach_leaves_a_plan_to_coast(robot_filter):
