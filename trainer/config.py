@@ -40,7 +40,7 @@ class Config:
     """Environments stepped side by side."""
     action_repeat: int = 5
     """Control steps that a decision is held for during training; the exported policy decides every step."""
-    epoch_steps: int = 10_000
+    epoch_steps: int = 20_000
     """Control steps between two updates, over all environments; a multiple of num_envs · action_repeat."""
     episode_steps: int = 1000
     """Steps of a full episode [steps]; turns the cost limit into the state-wise limit."""
@@ -81,9 +81,7 @@ class Config:
     """Weight of the squared excess of the policy's mean over the action range, which keeps it exploring."""
     initial_log_std: float = 0.0
     """Initial log standard deviation of the policy's actions."""
-    final_log_std: float = -1.6
-    """Largest log standard deviation at the end of the run; the bound falls linearly from the initial one.
-    What is learnt with much noise need not hold without: a robot may stay where only noise would move it."""
+
 
     rescale: Literal["mean", "state"] | None = None
     """lagnet, lagnet-foresight: divide eq. 14 by 1 + mean λ, or each state's term by 1 + λ_ξ(s) σ_c. Not set:
@@ -110,9 +108,9 @@ class Config:
     """lagnet-foresight: whether λ differs between states; if not, each takes the mean (an ablation)."""
     scale_init: float = 30.0
     """lagnet-foresight: the value the scale β starts at; λ_ξ(s) = β C̄_ξ(s)."""
-    scale_gain: float = 0.025
+    scale_gain: float = 0.05
     """lagnet-foresight: log β moves by this much an epoch for each relative excess of the cost over d."""
-    scale_step: float = 0.025
+    scale_step: float = 0.05
     """lagnet-foresight: largest change of log β in an epoch."""
 
     dual_init: float = 0.001

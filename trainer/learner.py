@@ -104,10 +104,7 @@ class Learner:
         optimiser.step()
 
     def start_epoch(self, progress: float) -> None:
-        """Sets step size, entropy bonus and largest noise for the share of the run that is done [0, 1)."""
-        first, last = self.config.initial_log_std, self.config.final_log_std
-        with torch.no_grad():
-            self.actor[self.actor_shape.size :].clamp_(max=first + min(0.0, last - first) * progress)
+        """Sets the actor's step size and entropy bonus for the share of the run that is done [0, 1)."""
         self.entropy = self.config.entropy * (1 - progress)
         self.optimisers["actor"].param_groups[0]["lr"] = self.config.learning_rate * (1 - progress)
 
