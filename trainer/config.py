@@ -82,7 +82,6 @@ class Config:
     initial_log_std: float = 0.0
     """Initial log standard deviation of the policy's actions."""
 
-
     rescale: Literal["mean", "state"] | None = None
     """lagnet, lagnet-foresight: divide eq. 14 by 1 + mean λ, or each state's term by 1 + λ_ξ(s) σ_c. Not set:
     "mean" for lagnet, "state" for lagnet-foresight."""
