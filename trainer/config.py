@@ -81,6 +81,9 @@ class Config:
     """Weight of the squared excess of the policy's mean over the action range, which keeps it exploring."""
     initial_log_std: float = 0.0
     """Initial log standard deviation of the policy's actions."""
+    final_log_std: float = -2.0
+    """Largest log standard deviation in the last tenth of the run; the bound falls in the second half. What
+    is learnt with much noise need not hold without: a robot may stay where only noise would move it."""
 
     rescale: Literal["mean", "state"] | None = None
     """lagnet, lagnet-foresight: divide eq. 14 by 1 + mean λ, or each state's term by 1 + λ_ξ(s) σ_c. Not set:

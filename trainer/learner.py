@@ -20,6 +20,8 @@ from trainer.rollout import Trajectory
 
 ADAM = ("step", "exp_avg", "exp_avg_sq")
 Figures = dict[str, float]
+SETTLING = (0.5, 0.9)
+"""Shares of the run between which the largest noise falls: the last tenth shows nearly what is exported."""
 REWARD, COST = 0, 1
 """Rows of the critics' parameters."""
 
@@ -104,7 +106,12 @@ class Learner:
         optimiser.step()
 
     def start_epoch(self, progress: float) -> None:
-        """Sets the actor's step size and entropy bonus for the share of the run that is done [0, 1)."""
+        """Sets step size, entropy bonus and largest noise for the share of the run that is done [0, 1)."""
+        config = self.config
+        first, last = config.initial_log_std, min(config.initial_log_std, config.final_log_std)
+        settled = min(1.0, max(0.0, (progress - SETTLING[0]) / (SETTLING[1] - SETTLING[0])))
+        with torch.no_grad():
+            self.actor[self.actor_shape.size :].clamp_(max=first + (last - first) * settled)
         self.entropy = self.config.entropy * (1 - progress)
         self.optimisers["actor"].param_groups[0]["lr"] = self.config.learning_rate * (1 - progress)
 
