@@ -47,7 +47,7 @@ class Config:
     threads: int = 2
     """Threads for physics, and for the update (one for the policy, one for the critics)."""
 
-    discount: float = 0.995
+    discount: float = 0.99
     """Discount γ of the reward, a control step."""
     cost_discount: float = 0.99
     """Discount γ of the cost, a control step."""
