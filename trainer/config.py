@@ -52,7 +52,10 @@ class Config:
     cost_discount: float = 0.99
     """Discount γ of the cost, a control step."""
     gae: float = 0.95
-    """λ of generalised advantage estimation, for the reward and the cost, a decision."""
+    """λ of generalised advantage estimation for the reward, a decision; also of C̄_ξ's targets."""
+    cost_gae: float = 0.8
+    """λ of generalised advantage estimation for the cost: where few steps cost anything, longer returns are
+    mostly noise."""
     passes: int = 10
     """Passes over an epoch's data in one update, at most."""
     minibatch: int = 500
@@ -189,7 +192,7 @@ _NOT_NEGATIVE = (
     "cost_limit", "seed", "entropy", "nearness", "saturation", "critic_l2", "multiplier_init", "scale_gain",
     "dual_init", "pid_kp", "pid_ki", "pid_kd", "damping",
 )  # fmt: skip
-_FRACTION = ("discount", "cost_discount", "gae", "foresight", "pid_smoothing")
+_FRACTION = ("discount", "cost_discount", "gae", "cost_gae", "foresight", "pid_smoothing")
 
 
 def check(config: Config) -> None:

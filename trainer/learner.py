@@ -151,12 +151,18 @@ class Learner:
         rows = torch.from_numpy(order)
         advantages, targets = [], []
         ended, terminated = trajectory.ended, trajectory.terminated
-        for k, signal, discount, over in (
-            (REWARD, trajectory.reward, config.per_decision(config.discount), terminated),
-            (COST, trajectory.cost, cost_discount, terminated if cost_outlives_episode else ended),
+        for k, signal, discount, smoothing, over in (
+            (REWARD, trajectory.reward, config.per_decision(config.discount), config.gae, terminated),
+            (
+                COST,
+                trajectory.cost,
+                cost_discount,
+                config.cost_gae,
+                terminated if cost_outlives_episode else ended,
+            ),
         ):
             after = successor_values(values[k], ended, over, final_values[k])
-            advantage = gae(signal, values[k], after, ended, discount, config.gae)
+            advantage = gae(signal, values[k], after, ended, discount, smoothing)
             advantages.append(torch.from_numpy(advantage.reshape(-1)[order]))
             targets.append(torch.from_numpy((advantage + values[k][:-1]).reshape(-1)[order]))
         reward_advantage, cost_advantage = advantages
