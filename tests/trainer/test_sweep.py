@@ -326,6 +326,39 @@ def test_a_lost_cluster_is_one_clear_line(tmp_path, monkeypatch):
         drive(small(tmp_path), lambda run, attempt: Outcome(True))
 
 
+class Refusing:
+    """A Ray that cannot be initialised the first few times."""
+
+    def __init__(self, refusals):
+        self.refusals, self.calls = refusals, []
+
+    def init(self, address, **options):
+        self.calls.append(address)
+        if len(self.calls) <= self.refusals:
+            raise ConnectionAbortedError("Initialization failure from server")
+
+    def shutdown(self):
+        self.calls.append("shutdown")
+
+
+def test_a_cluster_that_refuses_at_first_is_asked_again():
+    ray = Refusing(2)
+    driver._connect(ray, "ray://robot:10001", {})
+    assert ray.calls == [
+        "ray://robot:10001",
+        "shutdown",
+        "ray://robot:10001",
+        "shutdown",
+        "ray://robot:10001",
+    ]
+    with pytest.raises(driver.ConfigError, match=r"cannot start Ray on ray://robot:10001: Initialization"):
+        driver._connect(Refusing(3), "ray://robot:10001", {})
+    alone = Refusing(1)
+    with pytest.raises(driver.ConfigError, match="cannot start Ray on this machine"):
+        driver._connect(alone, None, {})
+    assert alone.calls == ["local"]
+
+
 def test_without_ray_the_sweep_says_how_to_get_it(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(ConfigError, match=r"pip install 'lagnet\[sweep\]'"):

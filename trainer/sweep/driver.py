@@ -28,6 +28,8 @@ GRACE = 60.0
 """How long stopped runs have to complete their epoch and write their checkpoint [s]."""
 _ANSWER = 10.0
 """How long a cluster has to accept a connection [s]."""
+_ATTEMPTS = 3
+"""How often a cluster is asked for a connection before that is given up."""
 _STORE = 80_000_000
 """Size of Ray's object store on this machine [bytes]: next to nothing passes through it."""
 
@@ -92,15 +94,27 @@ def _ray(settings: Sweep) -> Iterator[Any]:
     options["logging_level"] = logging.ERROR
     if settings.address is None:
         options |= {"include_dashboard": False, "object_store_memory": _STORE, "num_cpus": settings.cores}
-    try:
-        ray.init(settings.address or "local", **options)
-    except (OSError, RuntimeError, ValueError, TimeoutError) as error:
-        where = settings.address or "this machine"
-        raise ConfigError(f"cannot start Ray on {where}: {error}") from error
+    _connect(ray, settings.address, options)
     try:
         yield ray
     finally:
         ray.shutdown()
+
+
+def _connect(ray: Any, address: str | None, options: dict[str, Any]) -> None:
+    """ray.init; a cluster is asked again, for its client server now and then fails to start at first.
+
+    Raises:
+        ConfigError: if Ray does not start, or the cluster refuses to the last.
+    """
+    for attempt in range(1, _ATTEMPTS + 1):
+        try:
+            ray.init(address or "local", **options)
+            return
+        except (OSError, RuntimeError, ValueError, TimeoutError) as error:
+            if address is None or attempt == _ATTEMPTS:
+                raise ConfigError(f"cannot start Ray on {address or 'this machine'}: {error}") from error
+            ray.shutdown()
 
 
 def _check_address(address: str) -> None:
