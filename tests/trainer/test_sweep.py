@@ -334,7 +334,8 @@ class Refusing:
 
     def init(self, address, **options):
         self.calls.append(address)
-        if len(self.calls) <= self.refusals:
+        self.refusals -= 1
+        if self.refusals >= 0:
             raise ConnectionAbortedError("Initialization failure from server")
 
     def shutdown(self):
