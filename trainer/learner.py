@@ -112,8 +112,8 @@ class Learner:
         settled = min(1.0, max(0.0, (progress - SETTLING[0]) / (SETTLING[1] - SETTLING[0])))
         with torch.no_grad():
             self.actor[self.actor_shape.size :].clamp_(max=first + (last - first) * settled)
-        self.entropy = self.config.entropy * (1 - progress)
-        self.optimisers["actor"].param_groups[0]["lr"] = self.config.learning_rate * (1 - progress)
+        self.entropy = config.entropy * (1 - progress)
+        self.optimisers["actor"].param_groups[0]["lr"] = config.learning_rate * (1 - progress)
 
     def policy(self, observation: Tensor) -> tuple[Tensor, Tensor]:
         """Mean [B, a] and log standard deviation [a] for the networks' inputs [B, m]."""
