@@ -44,12 +44,12 @@ def episodes(env: VectorEnv[Any, Any, Any], policy: Policy, count: int, steps: i
         policy: observations [N, n] → actions [N, a] within bounds.
         count: episodes wanted.
         steps: longest an episode may last [steps].
-        seed: of the first batch of layouts; the next batches take the following ones.
+        seed: of the first layout; the next ones take the following numbers.
 
     Returns:
         Exactly `count` episodes.
     """
-    parts = [_batch(env, policy, steps, seed + k) for k in range(-(-count // env.num_envs))]
+    parts = [_batch(env, policy, steps, seed + first) for first in range(0, count, env.num_envs)]
     reward, cost, observation = (np.concatenate(part, axis=1)[:, :count] for part in zip(*parts, strict=True))
     return Episodes(reward, cost, observation)
 

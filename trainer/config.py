@@ -75,8 +75,8 @@ class Config:
     critic_l2: float = 0.0
     """Weight of Σ p² over the critics' parameters in their loss (OmniSafe's is 0.001)."""
     nearness: float = 0.25
-    """Distance [m] over which the networks' nearness of a hazard, now and on the way on which the robot would
-    coast to rest (features.Nearness), falls by a factor e; 0 leaves these features out."""
+    """Distance [m] over which the nearness of a hazard falls by a factor e in what the networks see of the
+    surroundings (features.Surroundings); 0 leaves all that out."""
     action_range: tuple[float, ...] | None = None
     """Largest size of each action that the policy uses, which is also its unit. Not set: 0.05 for the point
     robot's thrust, which saturates there, and 1 for its turning; the task's bounds elsewhere."""

@@ -1,4 +1,4 @@
-"""What the networks see: the normalised observation, and how near the hazards are and will be."""
+"""What the networks see: the normalised observation, and how hazards and goal lie to the robot's way."""
 
 import re
 from dataclasses import dataclass
@@ -11,56 +11,106 @@ from trainer.config import Config
 from trainer.normaliser import Normaliser
 
 GAIN = 4.0
-"""Nearness of a hazard at distance 0; the order of the largest normalised observations."""
+"""Largest size of most of these numbers; the order of the largest normalised observations."""
 COASTING = 0.519
 """Decay time of the robot's speed without thrust [s], which coasts this times its velocity."""
+SHARPNESS = 12.0
+"""Concentration of the map's directions: a hazard shows in those within about 1/√12 rad of its own."""
 TINY = 1e-6
 Floats = npt.NDArray[np.float32]
 
 
 @dataclass(frozen=True)
-class Nearness:
-    """For every bin of the hazards' lidar: how near its hazard is, and how near it comes if the robot coasts.
+class Surroundings:
+    """How near the hazards are and will be, where the goal is, and what lies on the way there.
 
-    Each is GAIN · exp(−distance / length). A reading hardly changes over the last decimetres, which decide
-    whether a step costs anything; and what decides whether one of the next steps will is the distance of the
-    hazard from the way on which the robot coasts to rest, a segment of COASTING times the velocity. From
-    these numbers a network of this size learns far more of the cost than from readings and velocity.
+    A lidar reading hardly changes over the last decimetres, which decide whether a step costs anything; what
+    decides whether one of the next steps will is the way on which the robot coasts to rest, a segment of
+    COASTING times the velocity; and what decides the return is what lies between the robot and the goal. A
+    network of this size learns far more of that from the numbers below than from bins that turn with the
+    robot. With near(x) = GAIN · exp(−x / length), they are
 
-    A hazard's distance is its reading's, its bearing within the bin the middle of what the neighbours'
-    readings leave possible (exact for a hazard alone).
+    1. for every bin of the hazards' lidar, near(its hazard's distance),
+    2. near(that hazard's distance from the segment on which the robot would coast to rest),
+    3. near(its distance from the segment to the goal), or 0 for an empty bin;
+    4. a map that turns with the goal: for as many directions as bins, counter-clockwise from the goal's, the
+       largest GAIN · exp(−distance / 2 length) of a hazard there, falling with the angle between the two;
+    5. twice the unit vector to the goal (ahead, left), GAIN · exp(−its distance / 1 m), and GAIN times the
+       way on which the robot would coast (along that vector, to the left of it).
+
+    An object's distance is its reading's, its bearing within the bin the middle of what the neighbours'
+    readings leave possible: exact for an object alone. A goal out of sight has no direction and no nearness.
 
     Attributes:
-        readings: where the readings stand in the observation.
+        hazards: where the hazards' readings stand in the observation.
+        goal: where the goal's readings stand.
         velocity: where the velocity ahead and to the left stands.
         length: e-folding distance [m].
     """
 
-    readings: slice
+    hazards: slice
+    goal: slice
     velocity: slice
     length: float
 
     @property
     def size(self) -> int:
         """Numbers that it gives."""
-        return 2 * LIDAR_BINS
+        return 4 * LIDAR_BINS + 5
 
     def __call__(self, observation: npt.NDArray[np.floating]) -> Floats:
-        """Both nearnesses [..., 2 · bins] in raw observations [..., n]."""
-        reading: Floats = observation[..., self.readings].astype(np.float32)
-        distance = (1 - reading) * np.float32(LIDAR_RANGE)
-        divisor = np.maximum(reading, np.float32(TINY))
-        upper = np.minimum(np.roll(reading, -1, -1) / divisor, 1)
-        lower = np.maximum(1 - np.roll(reading, 1, -1) / divisor, 0)
-        bearing = (np.arange(LIDAR_BINS, dtype=np.float32) + (lower + upper) / 2) * np.float32(BIN_WIDTH)
-        x, y = distance * np.cos(bearing), distance * np.sin(bearing)
-        way = observation[..., self.velocity].astype(np.float32) * np.float32(COASTING)
-        dx, dy = way[..., :1], way[..., 1:]
-        share = np.clip((x * dx + y * dy) / (dx * dx + dy * dy + np.float32(TINY)), 0, 1)
-        passing = np.sqrt((x - share * dx) ** 2 + (y - share * dy) ** 2)
-        rate = np.float32(-1 / self.length)
-        near: Floats = np.float32(GAIN) * np.exp(rate * np.concatenate([distance, passing], axis=-1))
-        return near
+        """The numbers [..., size] for raw observations [..., n]."""
+        hazards = observation[..., self.hazards].astype(np.float32)
+        x, y, distance = _places(hazards)
+        ux, uy, away, seen = _goal(observation[..., self.goal].astype(np.float32))
+        coast = observation[..., self.velocity].astype(np.float32) * np.float32(COASTING)
+        cx, cy = coast[..., :1], coast[..., 1:]
+        along, left = x * ux + y * uy, y * ux - x * uy
+        rate, gain = np.float32(-1 / self.length), np.float32(GAIN)
+        to_goal = _from_segment(x, y, ux * away, uy * away)
+        near = np.concatenate([distance, _from_segment(x, y, cx, cy), to_goal], axis=-1)
+        near = gain * np.exp(rate * near)
+        near[..., -LIDAR_BINS:] *= hazards > 0
+        shown = self._map(along, left, distance)
+        coasting = gain * (cx * ux + cy * uy), gain * (cy * ux - cx * uy)
+        goal = 2 * ux, 2 * uy, gain * seen * np.exp(-away), *coasting
+        result: Floats = np.concatenate([near, shown, *goal], axis=-1)
+        return result
+
+    def _map(self, along: Floats, left: Floats, distance: Floats) -> Floats:
+        """Number 4, from the hazards' places in the frame of the goal [..., bins]."""
+        angle = np.arange(LIDAR_BINS, dtype=np.float32) * np.float32(BIN_WIDTH)
+        ratio = np.float32(SHARPNESS) / np.maximum(distance, np.float32(TINY))
+        cosine = (ratio * along)[..., None] * np.cos(angle) + (ratio * left)[..., None] * np.sin(angle)
+        level = distance * np.float32(-0.5 / self.length) - np.float32(SHARPNESS)
+        shown: Floats = np.float32(GAIN) * np.exp((cosine + level[..., None]).max(-2))
+        return shown
+
+
+def _places(reading: Floats) -> tuple[Floats, Floats, Floats]:
+    """Place x, y and distance [m] of the object in every bin of a lidar [..., bins]."""
+    distance = (1 - reading) * np.float32(LIDAR_RANGE)
+    divisor = np.maximum(reading, np.float32(TINY))
+    upper = np.minimum(np.roll(reading, -1, -1) / divisor, 1)
+    lower = np.maximum(1 - np.roll(reading, 1, -1) / divisor, 0)
+    bearing = (np.arange(LIDAR_BINS, dtype=np.float32) + (lower + upper) / 2) * np.float32(BIN_WIDTH)
+    return distance * np.cos(bearing), distance * np.sin(bearing), distance
+
+
+def _goal(reading: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+    """Of the only object: unit vector x, y (0 out of sight), distance [m], 1 in sight, else 0 [..., 1]."""
+    top = reading.argmax(-1)[..., None]
+    x, y, distance = (np.take_along_axis(of, top, -1) for of in _places(reading))
+    seen: Floats = np.take_along_axis(np.sign(reading), top, -1)
+    divisor: Floats = np.maximum(distance, np.float32(TINY))
+    return seen * x / divisor, seen * y / divisor, distance, seen
+
+
+def _from_segment(x: Floats, y: Floats, dx: Floats, dy: Floats) -> Floats:
+    """Distance of places [..., bins] from the segment between the robot and (dx, dy) [..., 1]."""
+    share = np.clip((x * dx + y * dy) / (dx * dx + dy * dy + np.float32(TINY)), 0, 1)
+    apart: Floats = np.sqrt((x - share * dx) ** 2 + (y - share * dy) ** 2)
+    return apart
 
 
 class Features:
@@ -68,27 +118,32 @@ class Features:
 
     Attributes:
         normaliser: of the raw observation.
-        nearness: None for a task without a hazards' lidar.
+        surroundings: None for a task without a hazards' lidar.
     """
 
-    def __init__(self, observations: int, nearness: Nearness | None) -> None:
+    def __init__(self, observations: int, surroundings: Surroundings | None) -> None:
         self.normaliser = Normaliser(observations)
-        self.nearness = nearness
-        self.size = observations + (nearness.size if nearness else 0)
+        self.surroundings = surroundings
+        self.size = observations + (surroundings.size if surroundings else 0)
 
     def __call__(self, observation: npt.NDArray[np.floating]) -> Floats:
         """Inputs [..., size] of raw observations [..., n]."""
         normalised = self.normaliser(observation)
-        if self.nearness is None:
+        if self.surroundings is None:
             return normalised
-        return np.concatenate([normalised, self.nearness(observation)], axis=-1)
+        return np.concatenate([normalised, self.surroundings(observation)], axis=-1)
 
 
-def nearness(config: Config) -> Nearness | None:
-    """The nearness of the task's hazards; None if it has none, or config.nearness is 0."""
+def surroundings(config: Config) -> Surroundings | None:
+    """The surroundings of the task; None if it has no hazards, or config.nearness is 0."""
     match = re.fullmatch(r"PointGoal([12])-v\d+", config.task)
     if match is None or config.nearness == 0:
         return None
     where = layout(int(match[1]))
     start = where.slice("velocimeter").start
-    return Nearness(where.slice("hazards_lidar"), slice(start, start + 2), config.nearness)
+    return Surroundings(
+        where.slice("hazards_lidar"),
+        where.slice("goal_lidar"),
+        slice(start, start + 2),
+        config.nearness,
+    )

@@ -14,7 +14,7 @@ from trainer.actions import ActionRange
 from trainer.advantage import gae, successor_values
 from trainer.config import Config
 from trainer.errors import CheckpointError, NonFiniteError
-from trainer.features import Features, nearness
+from trainer.features import Features, surroundings
 from trainer.networks import Shape, fast_mlp, gaussian, initial, log_probability
 from trainer.rollout import Trajectory
 
@@ -78,7 +78,7 @@ class Learner:
         self.edge = torch.from_numpy(actions.edge)
         self.rng = rng
         self.entropy = config.entropy
-        self.features = Features(observations, nearness(config))
+        self.features = Features(observations, surroundings(config))
         self.actor_shape = Shape(self.features.size, len(actions.unit))
         self.critic_shape = Shape(self.features.size, 1)
         log_std = torch.full((len(actions.unit),), config.initial_log_std)

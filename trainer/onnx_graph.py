@@ -11,7 +11,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 from pointgoal.observation import BIN_WIDTH, LIDAR_BINS, LIDAR_RANGE
 from trainer.actions import ActionRange
-from trainer.features import COASTING, GAIN, TINY, Features, Nearness
+from trainer.features import COASTING, GAIN, SHARPNESS, TINY, Features, Surroundings
 from trainer.networks import HIDDEN, Shape
 from trainer.normaliser import CLIP
 
@@ -33,7 +33,9 @@ class _Builder:
         self.constants.append(numpy_helper.from_array(np.asarray(value, kind), name))
         return name
 
-    def node(self, operator: str, *others: str, output: str | None = None, **attributes: int) -> None:
+    def node(
+        self, operator: str, *others: str, output: str | None = None, **attributes: int | list[int]
+    ) -> None:
         result = output or f"t{len(self.nodes)}"
         node = helper.make_node(operator, [self.last, *others], [result])
         node.attribute.extend(helper.make_attribute(name, value) for name, value in attributes.items())
@@ -60,10 +62,9 @@ class _Builder:
             self.node(operator, *others)
         return self.last
 
-    def nearness(self, near: Nearness) -> str:
-        """features.Nearness, operation by operation [batch, 2 · bins]."""
+    def places(self, reading: str) -> tuple[str, str, str]:
+        """features._places."""
         zero, half, one = self.constant(0.0), self.constant(0.5), self.constant(1.0)
-        reading = self.columns(near.readings)
         distance = self.chain(reading, ("Neg",), ("Add", one), ("Mul", self.constant(LIDAR_RANGE)))
         divisor = self.chain(reading, ("Max", self.constant(TINY)))
         upper = self.chain(self.rolled(reading, -1), ("Div", divisor), ("Min", one))
@@ -74,26 +75,87 @@ class _Builder:
         )
         x = self.chain(bearing, ("Cos",), ("Mul", distance))
         y = self.chain(bearing, ("Sin",), ("Mul", distance))
-        start = near.velocity.start
+        return x, y, distance
+
+    def goal(self, reading: str) -> tuple[str, str, str, str]:
+        """features._goal."""
+        found = self.places(reading)
+        self.last = reading
+        self.node("ArgMax", axis=1)
+        top = self.last
+        x, y, distance, seen = (self.taken(of, top) for of in (*found, self.chain(reading, ("Sign",))))
+        inverse = self.chain(distance, ("Max", self.constant(TINY)), ("Reciprocal",), ("Mul", seen))
+        return self.chain(x, ("Mul", inverse)), self.chain(y, ("Mul", inverse)), distance, seen
+
+    def taken(self, bins: str, which: str) -> str:
+        """Of each row, the number of one bin [batch, 1]."""
+        self.last = bins
+        self.node("GatherElements", which, axis=1)
+        return self.last
+
+    def sum_of_products(self, a: str, b: str, c: str, d: str) -> str:
+        """The number a b + c d."""
+        first = self.chain(a, ("Mul", b))
+        return self.chain(c, ("Mul", d), ("Add", first))
+
+    def from_segment(self, x: str, y: str, dx: str, dy: str) -> str:
+        """features._from_segment."""
+        square = self.chain(self.sum_of_products(dx, dx, dy, dy), ("Add", self.constant(TINY)))
+        share = self.chain(
+            self.sum_of_products(x, dx, y, dy),
+            ("Div", square), ("Max", self.constant(0.0)), ("Min", self.constant(1.0)),
+        )  # fmt: skip
+        ex, ey = self.chain(share, ("Mul", dx), ("Sub", x)), self.chain(share, ("Mul", dy), ("Sub", y))
+        return self.chain(self.sum_of_products(ex, ex, ey, ey), ("Sqrt",))
+
+    def map(self, length: float, along: str, left: str, distance: str) -> str:
+        """features.Surroundings._map."""
+        angle = np.arange(LIDAR_BINS) * BIN_WIDTH
+        last, sharpness = self.constant([2], np.int64), self.constant(SHARPNESS)
+        ratio = self.chain(distance, ("Max", self.constant(TINY)), ("Reciprocal",), ("Mul", sharpness))
+        ahead = self.chain(along, ("Mul", ratio), ("Unsqueeze", last), ("Mul", self.constant(np.cos(angle))))
+        cosine = self.chain(
+            left,
+            ("Mul", ratio), ("Unsqueeze", last), ("Mul", self.constant(np.sin(angle))), ("Add", ahead),
+        )  # fmt: skip
+        level = self.chain(distance, ("Mul", self.constant(-0.5 / length)), ("Sub", sharpness))
+        self.chain(level, ("Unsqueeze", last), ("Add", cosine))
+        self.node("ReduceMax", axes=[1], keepdims=0)
+        return self.chain(self.last, ("Exp",), ("Mul", self.constant(GAIN)))
+
+    def surroundings(self, surroundings: Surroundings) -> list[str]:
+        """features.Surroundings, operation by operation: its parts, to stand beside each other."""
+        gain = self.constant(GAIN)
+        hazards = self.columns(surroundings.hazards)
+        x, y, distance = self.places(hazards)
+        ux, uy, away, seen = self.goal(self.columns(surroundings.goal))
+        start = surroundings.velocity.start
         time = self.constant(COASTING)
-        dx, dy = (self.chain(self.columns(slice(k, k + 1)), ("Mul", time)) for k in (start, start + 1))
-        square = self.chain(dy, ("Mul", dy))
-        square = self.chain(dx, ("Mul", dx), ("Add", square), ("Add", self.constant(TINY)))
-        along = self.chain(y, ("Mul", dy))
-        share = self.chain(x, ("Mul", dx), ("Add", along), ("Div", square), ("Max", zero), ("Min", one))
-        ex = self.chain(share, ("Mul", dx), ("Sub", x))
-        ey = self.chain(share, ("Mul", dy), ("Sub", y))
-        aside = self.chain(ey, ("Mul", ey))
-        passing = self.chain(ex, ("Mul", ex), ("Add", aside), ("Sqrt",))
-        self.last = distance
-        self.node("Concat", passing, axis=1)
-        rate, gain = self.constant(-1 / near.length), self.constant(GAIN)
-        return self.chain(self.last, ("Mul", rate), ("Exp",), ("Mul", gain))
+        cx, cy = (self.chain(self.columns(slice(k, k + 1)), ("Mul", time)) for k in (start, start + 1))
+        along = self.sum_of_products(x, ux, y, uy)
+        left = self.sum_of_products(y, ux, x, self.chain(uy, ("Neg",)))
+        gx, gy = self.chain(ux, ("Mul", away)), self.chain(uy, ("Mul", away))
+        rate = self.constant(-1 / surroundings.length)
+        near, passing, to_goal = (
+            self.chain(of, ("Mul", rate), ("Exp",), ("Mul", gain))
+            for of in (distance, self.from_segment(x, y, cx, cy), self.from_segment(x, y, gx, gy))
+        )
+        occupied = self.chain(hazards, ("Sign",))
+        to_goal = self.chain(to_goal, ("Mul", occupied))
+        shown = self.map(surroundings.length, along, left, distance)
+        two = self.constant(2.0)
+        toward = [self.chain(of, ("Mul", two)) for of in (ux, uy)]
+        close = self.chain(away, ("Neg",), ("Exp",), ("Mul", seen), ("Mul", gain))
+        coasting = [
+            self.chain(self.sum_of_products(cx, ux, cy, uy), ("Mul", gain)),
+            self.chain(self.sum_of_products(cy, ux, cx, self.chain(uy, ("Neg",))), ("Mul", gain)),
+        ]
+        return [near, passing, to_goal, shown, *toward, close, *coasting]
 
     def features(self, features: Features) -> None:
         """The networks' inputs, see features.Features."""
         mean, inverse = features.normaliser.scale()
-        others = [] if features.nearness is None else [self.nearness(features.nearness)]
+        others = [] if features.surroundings is None else self.surroundings(features.surroundings)
         self.last = "observation"
         self.node("Sub", self.constant(mean))
         self.node("Mul", self.constant(inverse))

@@ -16,3 +16,12 @@ def test_the_cost_of_an_episode_is_the_tasks_whatever_the_algorithm_constrains()
     np.testing.assert_array_equal(constrained.costs, plain.costs)
     np.testing.assert_array_equal(constrained.returns, plain.returns)
     assert constrained.observation.shape == (300, 6, 61)
+
+
+def test_every_episode_has_its_own_layout():
+    env = prepare_environments("ppo", PointGoalVectorEnv(1, 4, num_threads=1), 1)
+    played = episodes(env, lambda seen: np.zeros((len(seen), 2)), 10, 2, 3)
+    first = played.observation[0]
+    assert len(np.unique(first, axis=0)) == 10
+    alone, _ = PointGoalVectorEnv(1, 10, num_threads=1).reset(seed=3)
+    np.testing.assert_array_equal(first, alone.astype(np.float32))

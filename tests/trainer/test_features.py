@@ -5,9 +5,9 @@ from hypothesis import strategies as st
 
 from pointgoal.observation import layout
 from trainer.config import Config
-from trainer.features import COASTING, GAIN, Features, nearness
+from trainer.features import COASTING, GAIN, SHARPNESS, Features, surroundings
 
-LIDAR = layout(1).slice("hazards_lidar")
+HAZARDS, GOAL = layout(1).slice("hazards_lidar"), layout(1).slice("goal_lidar")
 VELOCITY = layout(1).slice("velocimeter").start
 
 
@@ -18,35 +18,89 @@ def distance_to_segment(point, end):
 
 
 @pytest.mark.parametrize(
-    ("task", "numbers"), [("PointGoal0-v0", 0), ("PointGoal1-v0", 32), ("PointGoal2-v0", 32)]
+    ("task", "numbers"), [("PointGoal0-v0", 0), ("PointGoal1-v0", 69), ("PointGoal2-v0", 69)]
 )
-def test_nearness_belongs_to_tasks_with_hazards(task, numbers):
+def test_surroundings_belong_to_tasks_with_hazards(task, numbers):
     size = layout(int(task[9])).size
-    features = Features(size, nearness(Config(task=task)))
+    features = Features(size, surroundings(Config(task=task)))
     assert features.size == size + numbers
     assert features(np.zeros((2, size))).shape == (2, features.size)
 
 
-@settings(max_examples=200)
-@given(
-    distance=st.floats(0.05, 2.9),
-    bearing=st.floats(-np.pi, np.pi),
-    velocity=st.tuples(st.floats(-1.5, 1.5), st.floats(-1.5, 1.5)),
-)
-def test_nearness_of_a_hazard_alone_is_exact(distance, bearing, velocity):
+def show(observation, lidar, distance, bearing):
+    """Puts an object into a lidar as the simulation does; returns its bin."""
     place = np.remainder(bearing, 2 * np.pi) * 8 / np.pi
     b, share, reading = int(place) % 16, place - int(place), 1 - distance / 3
-    observation = np.zeros(60)
     for k, value in ((b, reading), (b + 1, share * reading), (b - 1, (1 - share) * reading)):
-        observation[LIDAR.start + k % 16] = value
+        observation[lidar.start + k % 16] = value
+    return b
+
+
+def place(distance, bearing):
+    return distance * np.array([np.cos(bearing), np.sin(bearing)])
+
+
+angles = st.floats(-np.pi, np.pi)
+distances = st.floats(0.05, 2.9)
+
+
+@settings(max_examples=200)
+@given(
+    hazard=st.tuples(distances, angles),
+    goal=st.tuples(distances, angles),
+    velocity=st.tuples(st.floats(-1.5, 1.5), st.floats(-1.5, 1.5)),
+)
+def test_surroundings_of_one_hazard_and_the_goal_are_exact(hazard, goal, velocity):
+    observation = np.zeros(60)
+    b = show(observation, HAZARDS, *hazard)
+    show(observation, GOAL, *goal)
     observation[VELOCITY : VELOCITY + 2] = velocity
-    near = nearness(Config(nearness=0.5))(observation)
-    assert near[b] == pytest.approx(GAIN * np.exp(-distance / 0.5), rel=1e-4)
-    hazard = distance * np.array([np.cos(bearing), np.sin(bearing)])
-    passing = distance_to_segment(hazard, COASTING * np.array(velocity))
-    assert near[16 + b] == pytest.approx(GAIN * np.exp(-passing / 0.5), rel=2e-3)
+    given_ = surroundings(Config(nearness=0.5))(observation)
+    now, coasting, corridor, around, toward = np.split(given_, [16, 32, 48, 64])
+
+    def near(distance):
+        return pytest.approx(GAIN * np.exp(-distance / 0.5), rel=2e-3, abs=1e-4)
+
+    coast, to_hazard, to_goal = COASTING * np.array(velocity), place(*hazard), place(*goal)
+    assert now[b] == near(hazard[0])
+    assert coasting[b] == near(distance_to_segment(to_hazard, coast))
+    assert corridor[b] == near(distance_to_segment(to_hazard, to_goal))
+    unit = to_goal / goal[0]
+    sideways = np.array([-unit[1], unit[0]])
+    expected = [*2 * unit, GAIN * np.exp(-goal[0]), GAIN * coast @ unit, GAIN * coast @ sideways]
+    assert toward == pytest.approx(expected, abs=2e-3)
+    apart = hazard[1] - goal[1] - np.arange(16) * np.pi / 8
+    level = GAIN * np.exp(-hazard[0])  # 2 · 0.5 m
+    # The empty bins hold hazards at 3 m; the neighbours' readings are places of their own, further away.
+    assert (around >= level * np.exp(SHARPNESS * (np.cos(apart) - 1)) - 1e-3).all()
+    best = np.argmax(np.cos(apart))
+    assert around[best] == pytest.approx(level * np.exp(SHARPNESS * (np.cos(apart[best]) - 1)), abs=0.2)
 
 
-def test_nearness_can_be_left_out():
-    assert nearness(Config(nearness=0.0)) is None
-    assert nearness(Config(task="Other-v0")) is None
+def test_the_map_turns_with_the_goal():
+    def around(turn):
+        observation = np.zeros(60)
+        for distance, bearing in ((0.4, 0.3), (0.9, 2.0), (1.5, 4.4)):
+            show(observation, HAZARDS, distance, bearing + turn)
+        show(observation, GOAL, 1.2, 1.1 + turn)
+        return surroundings(Config())(observation)[48:64]
+
+    for turn in np.linspace(0, 2 * np.pi, 16, endpoint=False):  # by whole bins
+        assert around(turn) == pytest.approx(around(0.0), abs=1e-3)
+    assert np.argmax(around(0.0)) == round((0.3 - 1.1) / (np.pi / 8)) % 16
+
+
+def test_a_goal_out_of_sight_and_empty_bins_show_nothing():
+    observation = np.zeros(60)
+    b = show(observation, HAZARDS, 0.5, 0.1)
+    unseen = surroundings(Config())(observation)
+    assert (unseen[64:] == 0).all()
+    assert (unseen[48:64] < 1e-3).all()
+    show(observation, GOAL, 2.99, np.pi)
+    corridor = surroundings(Config())(observation)[32:48]
+    assert np.flatnonzero(corridor).tolist() == sorted([b, (b + 1) % 16, (b - 1) % 16])
+
+
+def test_surroundings_can_be_left_out():
+    assert surroundings(Config(nearness=0.0)) is None
+    assert surroundings(Config(task="Other-v0")) is None
