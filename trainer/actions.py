@@ -1,5 +1,6 @@
 """From what the policy draws to what the environment is sent."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,35 +13,45 @@ from trainer.errors import ConfigError
 Floats = npt.NDArray[np.float32]
 USEFUL = {"PointGoal": (0.05, 1.0)}
 """Largest action that still makes a difference, by the task's name: the robot's thrust saturates at 0.05."""
+DEAD = {"PointGoal": (0.0, 0.093)}
+"""Largest action that makes no difference yet. The servo that turns the robot is stiffer than the physics
+step resolves and chatters between ±0.476 rad/s; below 0.3 · 0.476 − 0.05 its torque saturates in both halves
+of the swing, they cancel, and the robot does not turn at all."""
+RAMP = 0.01
+"""Draw within which the dead zone is crossed."""
 
 
 @dataclass(frozen=True)
 class ActionRange:
-    """The policy draws in units of `unit`; what it draws is multiplied and clipped.
+    """What the policy draws is multiplied by `unit`, moved out of the dead zone and clipped.
 
     A policy whose mean lies far beyond the point where the robot saturates explores nothing: every draw is
     the same thrust, and no cost can teach it to brake. So the unit is where saturation begins, and the update
-    draws the mean back to `edge`.
+    draws the mean back to `edge`. In a dead zone, noise has an effect where the mean alone has none: what is
+    learnt with noise would come to a standstill without.
 
     Attributes:
         unit: [a].
+        dead: largest action without effect [a].
         low: smallest action sent [a].
         high: largest action sent [a].
     """
 
     unit: Floats
+    dead: Floats
     low: Floats
     high: Floats
 
     @property
     def edge(self) -> Floats:
         """The draw from which on nothing changes [a]."""
-        edge: Floats = (np.minimum(-self.low, self.high) / self.unit).astype(np.float32)
+        edge: Floats = ((np.minimum(-self.low, self.high) - self.dead) / self.unit).astype(np.float32)
         return edge
 
     def sent(self, drawn: Floats) -> Floats:
         """Actions within the bounds [..., a] for the policy's draws [..., a]."""
-        action: Floats = np.clip(drawn * self.unit, self.low, self.high)
+        jump = self.dead * np.clip(drawn * np.float32(1 / RAMP), -1, 1)
+        action: Floats = np.clip(drawn * self.unit + jump, self.low, self.high)
         return action
 
 
@@ -59,11 +70,16 @@ def action_range(config: Config, space: Box) -> ActionRange:
     """
     useful = config.action_range
     if useful is None:
-        useful = next((found for name, found in USEFUL.items() if config.task.startswith(name)), ())
+        useful = _known(USEFUL, config.task)
+    zeros = np.zeros(space.shape, np.float32)
     if not useful:
-        ones = np.ones(space.shape, np.float32)
-        return ActionRange(ones, space.low.astype(np.float32), space.high.astype(np.float32))
+        return ActionRange(zeros + 1, zeros, space.low.astype(np.float32), space.high.astype(np.float32))
     unit = np.asarray(useful, np.float32)
     if unit.shape != space.shape or (unit <= 0).any() or (unit > np.minimum(-space.low, space.high)).any():
         raise ConfigError(f"--action-range must give {space.shape[0]} numbers above 0 within {space}")
-    return ActionRange(unit, -unit, unit)
+    dead = zeros + np.asarray(_known(DEAD, config.task) or 0, np.float32)
+    return ActionRange(unit, dead, -unit, unit)
+
+
+def _known(table: Mapping[str, tuple[float, ...]], task: str) -> tuple[float, ...]:
+    return next((found for name, found in table.items() if task.startswith(name)), ())

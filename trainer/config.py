@@ -113,8 +113,8 @@ class Config:
     """lagnet-foresight: whether λ differs between states; if not, each takes the mean (an ablation)."""
     scale_init: float = 30.0
     """lagnet-foresight: the value the scale β starts at; λ_ξ(s) = β C̄_ξ(s)."""
-    scale_gain: float = 0.05
-    """lagnet-foresight: log β moves by this much an epoch for each relative excess of the cost over d."""
+    scale_gain: float = 0.08
+    """lagnet-foresight: log β moves by this much an epoch for each unit of episode cost above d."""
     scale_step: float = 0.05
     """lagnet-foresight: largest change of log β in an epoch."""
 

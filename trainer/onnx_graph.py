@@ -10,7 +10,7 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 
 from pointgoal.observation import BIN_WIDTH, LIDAR_BINS, LIDAR_RANGE
-from trainer.actions import ActionRange
+from trainer.actions import RAMP, ActionRange
 from trainer.features import COASTING, GAIN, SHARPNESS, TINY, Features, Surroundings
 from trainer.networks import HIDDEN, Shape
 from trainer.normaliser import CLIP
@@ -205,7 +205,13 @@ def policy_graph(theta: Floats, shape: Shape, features: Features, actions: Actio
     """
     builder = _Builder()
     builder.network(theta, shape, features)
-    builder.node("Mul", builder.constant(actions.unit))
+    one, drawn = builder.constant(1.0), builder.last
+    jump = builder.chain(
+        drawn,
+        ("Mul", builder.constant(1 / RAMP)), ("Max", builder.constant(-1.0)), ("Min", one),
+        ("Mul", builder.constant(actions.dead)),
+    )  # fmt: skip
+    builder.chain(drawn, ("Mul", builder.constant(actions.unit)), ("Add", jump))
     builder.node("Max", builder.constant(actions.low))
     builder.node("Min", builder.constant(actions.high), output="action")
     return builder.model(len(features.normaliser.mean), "action", ["batch", shape.outputs])

@@ -3,6 +3,7 @@ import pytest
 import torch
 from gymnasium.spaces import Box
 
+from pointgoal.vector import PointGoalVectorEnv
 from trainer.actions import action_range
 from trainer.config import Config
 from trainer.errors import ConfigError
@@ -14,8 +15,25 @@ ROBOT = Box(-1, 1, (2,), np.float64)
 def test_the_robots_thrust_is_drawn_in_units_of_its_saturation():
     actions = action_range(Config(), ROBOT)
     sent = actions.sent(np.float32([[0.5, 0.5], [-3, 3], [9, -9]]))
-    np.testing.assert_allclose(sent, [[0.025, 0.5], [-0.05, 1], [0.05, -1]])
-    np.testing.assert_array_equal(actions.edge, [1, 1])
+    np.testing.assert_allclose(sent, [[0.025, 0.593], [-0.05, 1], [0.05, -1]])
+    np.testing.assert_allclose(actions.edge, [1, 1 - 0.093])
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_what_the_policy_draws_turns_the_robot_however_small(sign):
+    """The servo's dead zone is as wide as it is said to be, and the range leads out of it."""
+    actions = action_range(Config(), ROBOT)
+    dead = float(actions.dead[1])
+    small = actions.sent(np.float32([[0, sign * 0.02]]))[0]
+    env = PointGoalVectorEnv(1, 3, num_threads=1)
+    env.reset(seed=0)
+    before = env.pose[:, 2].copy()
+    for _ in range(100):
+        env.step(np.array([[0, sign * (dead - 0.003)], [0, sign * (dead + 0.01)], small]))
+    turned = sign * (env.pose[:, 2] - before)
+    assert abs(turned[0]) < 0.01
+    assert turned[1] > 0.05
+    assert turned[2] > 0.05
 
 
 def test_another_task_keeps_its_bounds():

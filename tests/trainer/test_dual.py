@@ -54,7 +54,7 @@ def test_scale_grows_geometrically_at_its_largest_step_and_rests_at_the_limit():
     for _ in range(20):
         scale = next_scale(scale, cost=100.0, target=1.0, gain=0.05, step=0.05)
     assert scale == pytest.approx(10 * np.exp(20 * 0.05))
-    assert next_scale(scale, cost=1.0, target=1.0, gain=0.05, step=0.05) == scale
-    assert next_scale(scale, cost=0.0, target=1.0, gain=0.02, step=0.05) == pytest.approx(
+    assert next_scale(scale, cost=2.0, target=2.0, gain=0.05, step=0.05) == scale
+    assert next_scale(scale, cost=1.5, target=2.0, gain=0.04, step=0.05) == pytest.approx(
         scale * np.exp(-0.02)
     )

@@ -9,7 +9,9 @@ from trainer.learner import Learner
 def noise(progress, **settings):
     """Log standard deviations of a new policy at a share of the run."""
     unit = np.ones(2, np.float32)
-    learner = Learner(Config(**settings), 5, ActionRange(unit, -unit, unit), np.random.default_rng(0))
+    learner = Learner(
+        Config(**settings), 5, ActionRange(unit, 0 * unit, -unit, unit), np.random.default_rng(0)
+    )
     learner.start_epoch(progress)
     return learner.actor.detach().numpy()[-2:], learner
 

@@ -27,7 +27,9 @@ def make(algorithm, **settings):
         threads=1, kl_stop=10.0, episode_steps=10, **settings,
     )  # fmt: skip
     rng = np.random.default_rng(5)
-    learner = Learner(config, OBS, ActionRange(*np.float32([[1] * ACT, [-9] * ACT, [9] * ACT])), rng)
+    learner = Learner(
+        config, OBS, ActionRange(*np.float32([[1] * ACT, [0] * ACT, [-9] * ACT, [9] * ACT])), rng
+    )
     with torch.no_grad():  # away from the initial policy, whose mean is almost zero
         learner.actor += 0.1 * torch.from_numpy(rng.normal(size=learner.actor.shape).astype(np.float32))
     rule = ALGORITHMS[algorithm](learner)

@@ -91,17 +91,16 @@ class LagnetForesight(Algorithm):
 
 
 def next_scale(scale: float, cost: float, target: float, gain: float, step: float) -> float:
-    """β · exp(gain (J_c − d) / d), the exponent within ± step: dual ascent on log β.
+    """β · exp(gain (J_c − d)), the exponent within ± step: dual ascent on log β.
 
     Args:
         scale: β.
         cost: J_c.
         target: d, or the share of it that is aimed at.
-        gain: of the relative excess.
+        gain: of the excess.
         step: largest change of log β.
 
     Returns:
         The next β.
     """
-    excess = (cost - target) / max(target, 1e-3)
-    return scale * math.exp(max(-step, min(step, gain * excess)))
+    return scale * math.exp(max(-step, min(step, gain * (cost - target))))
