@@ -23,6 +23,7 @@ from typing import Annotated, Any
 
 import numpy as np
 import tyro
+from rich import box
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
@@ -60,6 +61,8 @@ class Comparison:
     """Deterministic evaluation episodes of each run."""
     processes: int = 2
     """Runs that are evaluated at the same time."""
+    markdown: bool = False
+    """Print the tables as Markdown."""
 
 
 @dataclass(frozen=True)
@@ -200,41 +203,52 @@ def keep_curve(run: Path, folder: Path) -> None:
     checkpoint.replace(keep / PROGRESS, ("\n".join(lines) + "\n").encode())
 
 
+COLUMNS = ("return", "cost", "return, det.", "p10", "cost, det.", "worst cost", "met", "λ")
+
+
 def tables(results: Sequence[Result]) -> list[Table]:
-    """One table a sweep and limit: means over the seeds, and the cost of the worst seed."""
-    groups: dict[tuple[str, float], dict[str, list[Result]]] = defaultdict(lambda: defaultdict(list))
+    """One table a sweep, a section a limit: means over the seeds, and the cost of the worst seed."""
+    sweeps: dict[str, list[Result]] = defaultdict(list)
     for result in results:
-        groups[result.sweep, result.cost_limit][result.algorithm].append(result)
-    for sweep, limit in sorted(groups):
-        for result in results:
-            # An algorithm that knows no limit is the same in every table.
-            if result.algorithm in UNLIMITED and result.sweep == sweep and result.cost_limit != limit:
-                groups[sweep, limit][result.algorithm].append(result)
-    return [_table(sweep, limit, groups[sweep, limit]) for sweep, limit in sorted(groups)]
+        sweeps[result.sweep].append(result)
+    return [_table(sweep, found) for sweep, found in sorted(sweeps.items())]
 
 
-def _table(sweep: str, limit: float, algorithms: dict[str, list[Result]]) -> Table:
-    settings = {result.settings for found in algorithms.values() for result in found}
-    said = ", ".join(sorted(settings - {""}))
-    table = Table(title=f"{sweep}, d = {limit}" + (f" ({said})" if said else ""), title_justify="left")
-    table.add_column("algorithm")
-    for name in ("seeds", "return", "cost", "return, det.", "p10", "cost, det.", "worst cost", "met", "λ"):
+def _table(sweep: str, results: Sequence[Result]) -> Table:
+    said = ", ".join(sorted({result.settings for result in results} - {""}))
+    table = Table(title=f"{sweep} ({said})" if said else sweep, title_justify="left")
+    for name in ("d", "algorithm"):
+        table.add_column(name)
+    for name in ("seeds", *COLUMNS):
         table.add_column(name, justify="right")
-    for name, found in sorted(algorithms.items(), key=lambda item: -_mean(item[1], "evaluation_return")):
-        worst = max(result.cost for result in found)
-        table.add_row(
-            name,
-            str(len(found)),
-            f"{_mean(found, 'training_return'):.1f}",
-            f"{_mean(found, 'training_cost'):.2f}",
-            f"{_mean(found, 'evaluation_return'):.1f}",
-            f"{_mean(found, 'evaluation_p10'):.1f}",
-            f"{_mean(found, 'evaluation_cost'):.2f}",
-            f"{worst:.2f}",
-            "yes" if worst <= limit else "no",
-            f"{_mean(found, 'multiplier'):.3g}",
-        )
+    limits = {result.cost_limit for result in results if result.algorithm not in UNLIMITED}
+    for limit in sorted(limits or {result.cost_limit for result in results}):
+        groups: dict[str, list[Result]] = defaultdict(list)
+        for result in results:
+            # An algorithm that knows no limit is the same beside every limit.
+            if result.cost_limit == limit or result.algorithm in UNLIMITED:
+                groups[result.algorithm].append(result)
+        rows = [_row(name, found, limit) for name, found in groups.items()]
+        for row in sorted(rows, key=lambda row: (row[-2] != "yes", -float(row[4]))):
+            table.add_row(str(limit), *row)
+        table.add_section()
     return table
+
+
+def _row(name: str, found: Sequence[Result], limit: float) -> list[str]:
+    met = sum(result.cost <= limit for result in found)
+    return [
+        name,
+        str(len(found)),
+        f"{_mean(found, 'training_return'):.1f}",
+        f"{_mean(found, 'training_cost'):.2f}",
+        f"{_mean(found, 'evaluation_return'):.1f}",
+        f"{_mean(found, 'evaluation_p10'):.1f}",
+        f"{_mean(found, 'evaluation_cost'):.2f}",
+        f"{max(result.cost for result in found):.2f}",
+        f"{met} of {len(found)}" if met < len(found) else "yes",
+        f"{_mean(found, 'multiplier'):.3g}",
+    ]
 
 
 def _mean(found: Sequence[Result], name: str) -> float:
@@ -245,6 +259,7 @@ def main() -> None:
     """Evaluate what is new, and print the tables."""
     settings = tyro.cli(Comparison, description=Comparison.__doc__)
     console = Console()
+    wide = Console(width=max(console.width, 120))
     results = {(result.sweep, result.run): result for result in read_record(settings.record)}
     runs = [(folder.name, run) for folder in settings.folders for run in finished_runs(folder)]
     new = [run for sweep, run in runs if (sweep, run.name) not in results]
@@ -255,7 +270,9 @@ def main() -> None:
             keep_curve(run, settings.record)
             write_record(settings.record, results.values())
     for table in tables(list(results.values())):
-        console.print(table)
+        if settings.markdown:
+            table.box = box.MARKDOWN
+        wide.print(table)
 
 
 if __name__ == "__main__":
