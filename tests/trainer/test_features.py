@@ -1,11 +1,17 @@
 import numpy as np
+import onnxruntime
 import pytest
+from gymnasium.spaces import Box
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pointgoal.observation import layout
+from trainer.actions import action_range
 from trainer.config import Config
 from trainer.features import COASTING, GAIN, SHARPNESS, Features, surroundings
+from trainer.networks import Shape, initial
+from trainer.onnx_graph import policy_graph
+from trainer.rollout import Inference
 
 HAZARDS, GOAL = layout(1).slice("hazards_lidar"), layout(1).slice("goal_lidar")
 VELOCITY = layout(1).slice("velocimeter").start
@@ -99,6 +105,28 @@ def test_a_goal_out_of_sight_and_empty_bins_show_nothing():
     show(observation, GOAL, 2.99, np.pi)
     corridor = surroundings(Config())(observation)[32:48]
     assert np.flatnonzero(corridor).tolist() == sorted([b, (b + 1) % 16, (b - 1) % 16])
+
+
+def test_the_onnx_graph_sees_what_the_networks_see():
+    rng = np.random.default_rng(0)
+    observation = rng.normal(0, 1, (300, 60))
+    observation[:, GOAL] = 0
+    for k in range(1, 300):  # the first one sees nothing at all
+        if k % 7:
+            show(observation[k], GOAL, rng.uniform(0.01, 2.9), rng.uniform(-np.pi, np.pi))
+        observation[k, HAZARDS] = rng.uniform(0, 1, 16) * (rng.uniform(size=16) < 0.5)
+    observation = observation.astype(np.float32)
+    features = Features(60, surroundings(Config()))
+    features.normaliser.update(observation)
+    shape = Shape(features.size, 2)
+    theta = initial(shape, rng, 1.0).numpy()
+    actions = action_range(Config(), Box(-1, 1, (2,)))
+    graph = policy_graph(theta, shape, features, actions)
+    session = onnxruntime.InferenceSession(graph, providers=["CPUExecutionProvider"])
+    (computed,) = session.run(["action"], {"observation": observation})
+    expected = actions.sent(Inference(np.append(theta, [0, 0]), shape)(features(observation)))
+    assert np.abs(expected).min() < 0.01 < np.abs(expected).max()
+    np.testing.assert_allclose(computed, expected, atol=2e-5)
 
 
 def test_surroundings_can_be_left_out():
