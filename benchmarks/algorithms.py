@@ -77,9 +77,11 @@ class Result:
         seed: of the run.
         steps: environment steps of training.
         training_return, training_cost: of the last 500 training episodes.
-        evaluation_return, evaluation_cost: of the deterministic episodes.
+        evaluation_return, evaluation_cost: of the deterministic episodes, decisions held as in training.
         evaluation_p10: tenth percentile of their return.
-        violating_steps: of them, a mean.
+        stepwise_return, stepwise_cost, stepwise_p10: of as many episodes in which the policy decides every
+            control step, as it does once exported.
+        violating_steps: of those, a mean.
         multiplier: λ of the last epoch, for a network its mean over the epoch's states.
         multiplier_peak: the largest that this was in any epoch.
     """
@@ -95,6 +97,9 @@ class Result:
     evaluation_return: float
     evaluation_cost: float
     evaluation_p10: float
+    stepwise_return: float
+    stepwise_cost: float
+    stepwise_p10: float
     violating_steps: float
     multiplier: float
     multiplier_peak: float
@@ -129,7 +134,8 @@ def evaluate(run: Path, episodes: int) -> Result:
 
     trained = TrainedRun(run)
     config = trained.config
-    played = play(trained, episodes, threads=1)
+    played = play(trained, episodes, threads=1, hold=config.action_repeat)
+    stepwise = play(trained, episodes, threads=1)
     columns = read_progress(run)
     last = closing(columns, TAIL)
     if last is None:
@@ -146,7 +152,10 @@ def evaluate(run: Path, episodes: int) -> Result:
         evaluation_return=float(played.returns.mean()),
         evaluation_cost=float(played.costs.mean()),
         evaluation_p10=float(np.percentile(played.returns, 10)),
-        violating_steps=float(np.nansum(played.cost > 0, 0).mean()),
+        stepwise_return=float(stepwise.returns.mean()),
+        stepwise_cost=float(stepwise.costs.mean()),
+        stepwise_p10=float(np.percentile(stepwise.returns, 10)),
+        violating_steps=float(np.nansum(stepwise.cost > 0, 0).mean()),
         multiplier=float(columns["multiplier"][-1]),
         multiplier_peak=float(np.nanmax(columns["multiplier"])),
     )
@@ -203,7 +212,7 @@ def keep_curve(run: Path, folder: Path) -> None:
     checkpoint.replace(keep / PROGRESS, ("\n".join(lines) + "\n").encode())
 
 
-COLUMNS = ("return", "cost", "return, det.", "p10", "cost, det.", "worst cost", "met", "λ")
+COLUMNS = ("return", "cost", "return, det.", "p10", "cost, det.", "worst cost", "met", "every step", "λ")
 
 
 def tables(results: Sequence[Result]) -> list[Table]:
@@ -229,7 +238,7 @@ def _table(sweep: str, results: Sequence[Result]) -> Table:
             if result.cost_limit == limit or result.algorithm in UNLIMITED:
                 groups[result.algorithm].append(result)
         rows = [_row(name, found, limit) for name, found in groups.items()]
-        for row in sorted(rows, key=lambda row: (row[-2] != "yes", -float(row[4]))):
+        for row in sorted(rows, key=lambda row: (row[-3] != "yes", -float(row[4]))):
             table.add_row(str(limit), *row)
         table.add_section()
     return table
@@ -247,6 +256,7 @@ def _row(name: str, found: Sequence[Result], limit: float) -> list[str]:
         f"{_mean(found, 'evaluation_cost'):.2f}",
         f"{max(result.cost for result in found):.2f}",
         f"{met} of {len(found)}" if met < len(found) else "yes",
+        f"{_mean(found, 'stepwise_return'):.1f} / {_mean(found, 'stepwise_cost'):.2f}",
         f"{_mean(found, 'multiplier'):.3g}",
     ]
 
@@ -259,7 +269,7 @@ def main() -> None:
     """Evaluate what is new, and print the tables."""
     settings = tyro.cli(Comparison, description=Comparison.__doc__)
     console = Console()
-    wide = Console(width=max(console.width, 120))
+    wide = Console(width=max(console.width, 140))
     results = {(result.sweep, result.run): result for result in read_record(settings.record)}
     runs = [(folder.name, run) for folder in settings.folders for run in finished_runs(folder)]
     new = [run for sweep, run in runs if (sweep, run.name) not in results]

@@ -169,17 +169,24 @@ def export(config: ExportConfig) -> Manifest:
     return write_bundle(config.bundle, policy, multiplier, manifest).manifest
 
 
-def play(run: TrainedRun, count: int, threads: int) -> Episodes:
-    """Deterministic closed-loop episodes of a run's policy on layouts that training never saw."""
+def play(run: TrainedRun, count: int, threads: int, hold: int = 1) -> Episodes:
+    """Deterministic closed-loop episodes of a run's policy on layouts that training never saw.
+
+    Args:
+        run: whose policy plays.
+        count: episodes.
+        threads: of the simulation.
+        hold: control steps that a decision is held for; the episodes' steps are decisions then.
+    """
     act = run.policy()
     features = run.learner.features
     settings = dataclasses.replace(run.config, num_envs=min(count, ENVIRONMENTS), threads=threads)
-    with closing(prepare_environments(settings.algorithm, make_environments(settings), 1)) as env:
+    with closing(prepare_environments(settings.algorithm, make_environments(settings), hold)) as env:
         return episodes(
             env,
             lambda observation: run.range.sent(act(features(observation))),
             count,
-            run.config.episode_steps,
+            run.config.episode_steps // hold,
             SEED + run.config.seed,
         )
 

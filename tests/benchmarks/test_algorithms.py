@@ -18,7 +18,8 @@ def result(algorithm="lagnet", cost_limit=1.0, seed=0, cost=0.5, **values):
     return Result(
         sweep="level1", algorithm=algorithm, settings="", cost_limit=cost_limit, seed=seed, steps=1000,
         training_return=20.0, training_cost=cost, evaluation_return=21.0, evaluation_cost=0.4,
-        evaluation_p10=15.0, violating_steps=10.0, multiplier=2.0, multiplier_peak=20.0, **values,
+        evaluation_p10=15.0, stepwise_return=20.5, stepwise_cost=0.6, stepwise_p10=12.0,
+        violating_steps=10.0, multiplier=2.0, multiplier_peak=20.0, **values,
     )  # fmt: skip
 
 
