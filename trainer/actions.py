@@ -78,6 +78,8 @@ def action_range(config: Config, space: Box) -> ActionRange:
     if unit.shape != space.shape or (unit <= 0).any() or (unit > np.minimum(-space.low, space.high)).any():
         raise ConfigError(f"--action-range must give {space.shape[0]} numbers above 0 within {space}")
     dead = zeros + np.asarray(_known(DEAD, config.task) or 0, np.float32)
+    if (unit <= dead).any():
+        raise ConfigError(f"--action-range must lie above {dead.tolist()}: smaller actions have no effect")
     return ActionRange(unit, dead, -unit, unit)
 
 

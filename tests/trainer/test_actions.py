@@ -41,7 +41,7 @@ def test_another_task_keeps_its_bounds():
     np.testing.assert_array_equal(actions.sent(np.float32([[-9], [9], [1.5]])), [[-3], [2], [1.5]])
 
 
-@pytest.mark.parametrize("useful", [(0.05,), (0.0, 1.0), (0.05, 1.5)])
+@pytest.mark.parametrize("useful", [(0.05,), (0.0, 1.0), (0.05, 1.5), (0.05, 0.09)])
 def test_a_range_that_does_not_fit_is_told(useful):
     with pytest.raises(ConfigError, match="--action-range"):
         action_range(Config(action_range=useful), ROBOT)
