@@ -212,9 +212,6 @@ def keep_curve(run: Path, folder: Path) -> None:
     checkpoint.replace(keep / PROGRESS, ("\n".join(lines) + "\n").encode())
 
 
-COLUMNS = ("return", "cost", "return, det.", "p10", "cost, det.", "worst cost", "met", "every step", "λ")
-
-
 def tables(results: Sequence[Result]) -> list[Table]:
     """One table a sweep, a section a limit: means over the seeds, and the cost of the worst seed."""
     sweeps: dict[str, list[Result]] = defaultdict(list)
@@ -228,7 +225,8 @@ def _table(sweep: str, results: Sequence[Result]) -> Table:
     table = Table(title=f"{sweep} ({said})" if said else sweep, title_justify="left")
     for name in ("d", "algorithm"):
         table.add_column(name)
-    for name in ("seeds", *COLUMNS):
+    training, deterministic = ("return", "cost"), ("return, det.", "p10", "cost, det.")
+    for name in ("seeds", *training, *deterministic, "worst cost", "met", "every step", "λ"):
         table.add_column(name, justify="right")
     limits = {result.cost_limit for result in results if result.algorithm not in UNLIMITED}
     for limit in sorted(limits or {result.cost_limit for result in results}):
@@ -237,11 +235,15 @@ def _table(sweep: str, results: Sequence[Result]) -> Table:
             # An algorithm that knows no limit is the same beside every limit.
             if result.cost_limit == limit or result.algorithm in UNLIMITED:
                 groups[result.algorithm].append(result)
-        rows = [_row(name, found, limit) for name, found in groups.items()]
-        for row in sorted(rows, key=lambda row: (row[-3] != "yes", -float(row[4]))):
-            table.add_row(str(limit), *row)
+        for name in sorted(groups, key=lambda name: _rank(groups[name], limit)):
+            table.add_row(str(limit), *_row(name, groups[name], limit))
         table.add_section()
     return table
+
+
+def _rank(found: Sequence[Result], limit: float) -> tuple[bool, float]:
+    """Sorts those first whose seeds all meet the limit, and then by their return."""
+    return any(result.cost > limit for result in found), -_mean(found, "evaluation_return")
 
 
 def _row(name: str, found: Sequence[Result], limit: float) -> list[str]:

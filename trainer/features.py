@@ -65,14 +65,13 @@ class Surroundings:
         ux, uy, away, seen = _goal(observation[..., self.goal].astype(np.float32))
         coast = observation[..., self.velocity].astype(np.float32) * np.float32(COASTING)
         cx, cy = coast[..., :1], coast[..., 1:]
-        along, left = x * ux + y * uy, y * ux - x * uy
         rate, gain = np.float32(-1 / self.length), np.float32(GAIN)
         to_goal = _from_segment(x, y, ux * away, uy * away)
         near = np.concatenate([distance, _from_segment(x, y, cx, cy), to_goal], axis=-1)
         near = gain * np.exp(rate * near)
         near[..., -LIDAR_BINS:] *= hazards > 0
-        shown = self._map(along, left, distance)
-        coasting = gain * (cx * ux + cy * uy), gain * (cy * ux - cx * uy)
+        shown = self._map(*_turned(x, y, ux, uy), distance)
+        coasting = [gain * part for part in _turned(cx, cy, ux, uy)]
         goal = 2 * ux, 2 * uy, gain * seen * np.exp(-away), *coasting
         result: Floats = np.concatenate([near, shown, *goal], axis=-1)
         return result
@@ -104,6 +103,11 @@ def _goal(reading: Floats) -> tuple[Floats, Floats, Floats, Floats]:
     seen: Floats = np.take_along_axis(np.sign(reading), top, -1)
     divisor: Floats = np.maximum(distance, np.float32(TINY))
     return seen * x / divisor, seen * y / divisor, distance, seen
+
+
+def _turned(x: Floats, y: Floats, ux: Floats, uy: Floats) -> tuple[Floats, Floats]:
+    """Parts of (x, y) along the unit vector (ux, uy) and to the left of it."""
+    return x * ux + y * uy, y * ux - x * uy
 
 
 def _from_segment(x: Floats, y: Floats, dx: Floats, dy: Floats) -> Floats:

@@ -98,13 +98,15 @@ class _Builder:
         first = self.chain(a, ("Mul", b))
         return self.chain(c, ("Mul", d), ("Add", first))
 
+    def turned(self, x: str, y: str, ux: str, uy: str) -> tuple[str, str]:
+        """features._turned."""
+        return self.sum_of_products(x, ux, y, uy), self.sum_of_products(y, ux, x, self.chain(uy, ("Neg",)))
+
     def from_segment(self, x: str, y: str, dx: str, dy: str) -> str:
         """features._from_segment."""
         square = self.chain(self.sum_of_products(dx, dx, dy, dy), ("Add", self.constant(TINY)))
-        share = self.chain(
-            self.sum_of_products(x, dx, y, dy),
-            ("Div", square), ("Max", self.constant(0.0)), ("Min", self.constant(1.0)),
-        )  # fmt: skip
+        clip = "Clip", self.constant(0.0), self.constant(1.0)
+        share = self.chain(self.sum_of_products(x, dx, y, dy), ("Div", square), clip)
         ex, ey = self.chain(share, ("Mul", dx), ("Sub", x)), self.chain(share, ("Mul", dy), ("Sub", y))
         return self.chain(self.sum_of_products(ex, ex, ey, ey), ("Sqrt",))
 
@@ -132,24 +134,18 @@ class _Builder:
         start = surroundings.velocity.start
         time = self.constant(COASTING)
         cx, cy = (self.chain(self.columns(slice(k, k + 1)), ("Mul", time)) for k in (start, start + 1))
-        along = self.sum_of_products(x, ux, y, uy)
-        left = self.sum_of_products(y, ux, x, self.chain(uy, ("Neg",)))
         gx, gy = self.chain(ux, ("Mul", away)), self.chain(uy, ("Mul", away))
         rate = self.constant(-1 / surroundings.length)
         near, passing, to_goal = (
             self.chain(of, ("Mul", rate), ("Exp",), ("Mul", gain))
             for of in (distance, self.from_segment(x, y, cx, cy), self.from_segment(x, y, gx, gy))
         )
-        occupied = self.chain(hazards, ("Sign",))
-        to_goal = self.chain(to_goal, ("Mul", occupied))
-        shown = self.map(surroundings.length, along, left, distance)
+        to_goal = self.chain(hazards, ("Sign",), ("Mul", to_goal))
+        shown = self.map(surroundings.length, *self.turned(x, y, ux, uy), distance)
         two = self.constant(2.0)
         toward = [self.chain(of, ("Mul", two)) for of in (ux, uy)]
         close = self.chain(away, ("Neg",), ("Exp",), ("Mul", seen), ("Mul", gain))
-        coasting = [
-            self.chain(self.sum_of_products(cx, ux, cy, uy), ("Mul", gain)),
-            self.chain(self.sum_of_products(cy, ux, cx, self.chain(uy, ("Neg",))), ("Mul", gain)),
-        ]
+        coasting = [self.chain(part, ("Mul", gain)) for part in self.turned(cx, cy, ux, uy)]
         return [near, passing, to_goal, shown, *toward, close, *coasting]
 
     def features(self, features: Features) -> None:
@@ -205,12 +201,10 @@ def policy_graph(theta: Floats, shape: Shape, features: Features, actions: Actio
     """
     builder = _Builder()
     builder.network(theta, shape, features)
-    one, drawn = builder.constant(1.0), builder.last
-    jump = builder.chain(
-        drawn,
-        ("Mul", builder.constant(1 / RAMP)), ("Max", builder.constant(-1.0)), ("Min", one),
-        ("Mul", builder.constant(actions.dead)),
-    )  # fmt: skip
+    drawn = builder.last
+    clip = "Clip", builder.constant(-1.0), builder.constant(1.0)
+    dead = builder.constant(actions.dead)
+    jump = builder.chain(drawn, ("Mul", builder.constant(1 / RAMP)), clip, ("Mul", dead))
     builder.chain(drawn, ("Mul", builder.constant(actions.unit)), ("Add", jump))
     builder.node("Max", builder.constant(actions.low))
     builder.node("Min", builder.constant(actions.high), output="action")
