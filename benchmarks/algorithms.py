@@ -213,21 +213,29 @@ def keep_curve(run: Path, folder: Path) -> None:
 
 
 def tables(results: Sequence[Result]) -> list[Table]:
-    """One table a sweep, a section a limit: means over the seeds, and the cost of the worst seed."""
+    """What is on record: means over the seeds, and the cost of the worst seed.
+
+    Returns:
+        One table a sweep, a section a limit. Sweeps of one algorithm at one limit, such as ablations, share
+        a table instead, a row a sweep, if another sweep has the same to compare them with.
+    """
     sweeps: dict[str, list[Result]] = defaultdict(list)
-    for result in results:
+    cases: dict[tuple[str, float], list[Result]] = defaultdict(list)
+    for result in sorted(results, key=lambda each: each.sweep):
         sweeps[result.sweep].append(result)
-    return [_table(sweep, found) for sweep, found in sorted(sweeps.items())]
+        cases[result.algorithm, result.cost_limit].append(result)
+    found, compared = [], set()
+    for sweep, members in sweeps.items():
+        case, *more = {(result.algorithm, result.cost_limit) for result in members}
+        if more or {result.sweep for result in cases[case]} == {sweep}:
+            found.append(_comparison(sweep, members))
+        else:
+            compared.add(case)
+    return found + [_variants(*case, cases[case]) for case in sorted(compared)]
 
 
-def _table(sweep: str, results: Sequence[Result]) -> Table:
-    said = ", ".join(sorted({result.settings for result in results} - {""}))
-    table = Table(title=f"{sweep} ({said})" if said else sweep, title_justify="left")
-    for name in ("d", "algorithm"):
-        table.add_column(name)
-    training, deterministic = ("return", "cost"), ("return, det.", "p10", "cost, det.")
-    for name in ("seeds", *training, *deterministic, "worst cost", "met", "every step", "λ"):
-        table.add_column(name, justify="right")
+def _comparison(sweep: str, results: Sequence[Result]) -> Table:
+    table = _table(sweep, "d", "algorithm")
     limits = {result.cost_limit for result in results if result.algorithm not in UNLIMITED}
     for limit in sorted(limits or {result.cost_limit for result in results}):
         groups: dict[str, list[Result]] = defaultdict(list)
@@ -236,8 +244,29 @@ def _table(sweep: str, results: Sequence[Result]) -> Table:
             if result.cost_limit == limit or result.algorithm in UNLIMITED:
                 groups[result.algorithm].append(result)
         for name in sorted(groups, key=lambda name: _rank(groups[name], limit)):
-            table.add_row(str(limit), *_row(name, groups[name], limit))
+            table.add_row(str(limit), name, *_row(groups[name], limit))
         table.add_section()
+    return table
+
+
+def _variants(algorithm: str, limit: float, results: Sequence[Result]) -> Table:
+    table = _table(f"{algorithm} at d = {limit}", "sweep")
+    groups: dict[str, list[Result]] = defaultdict(list)
+    for result in results:
+        groups[result.sweep].append(result)
+    for name in sorted(groups, key=lambda name: _rank(groups[name], limit)):
+        table.add_row(name, *_row(groups[name], limit))
+    return table
+
+
+def _table(title: str, *names: str) -> Table:
+    table = Table(title=title, title_justify="left")
+    for name in names:
+        table.add_column(name)
+    training, deterministic = ("return", "cost"), ("return, det.", "p10", "cost, det.")
+    for name in ("seeds", *training, *deterministic, "worst cost", "met", "every step", "λ", "peak λ"):
+        table.add_column(name, justify="right")
+    table.add_column("settings")
     return table
 
 
@@ -246,10 +275,9 @@ def _rank(found: Sequence[Result], limit: float) -> tuple[bool, float]:
     return any(result.cost > limit for result in found), -_mean(found, "evaluation_return")
 
 
-def _row(name: str, found: Sequence[Result], limit: float) -> list[str]:
+def _row(found: Sequence[Result], limit: float) -> list[str]:
     met = sum(result.cost <= limit for result in found)
     return [
-        name,
         str(len(found)),
         f"{_mean(found, 'training_return'):.1f}",
         f"{_mean(found, 'training_cost'):.2f}",
@@ -259,7 +287,9 @@ def _row(name: str, found: Sequence[Result], limit: float) -> list[str]:
         f"{max(result.cost for result in found):.2f}",
         f"{met} of {len(found)}" if met < len(found) else "yes",
         f"{_mean(found, 'stepwise_return'):.1f} / {_mean(found, 'stepwise_cost'):.2f}",
-        f"{_mean(found, 'multiplier'):.3g}",
+        f"{_mean(found, 'multiplier'):.2g}",
+        f"{max(result.multiplier_peak for result in found):.3g}",
+        ", ".join(sorted({result.settings for result in found} - {""})),
     ]
 
 
@@ -271,13 +301,14 @@ def main() -> None:
     """Evaluate what is new, and print the tables."""
     settings = tyro.cli(Comparison, description=Comparison.__doc__)
     console = Console()
-    wide = Console(width=max(console.width, 140))
+    wide = Console(width=max(console.width, 160))
     results = {(result.sweep, result.run): result for result in read_record(settings.record)}
     runs = [(folder.name, run) for folder in settings.folders for run in finished_runs(folder)]
     new = [run for sweep, run in runs if (sweep, run.name) not in results]
     with ProcessPoolExecutor(settings.processes) as pool:
         found = pool.map(evaluate, new, [settings.episodes] * len(new))
-        for run, result in zip(new, track(found, "evaluating", len(new), console=console), strict=True):
+        evaluated = track(found, "evaluating", len(new), console=console, disable=not new)
+        for run, result in zip(new, evaluated, strict=True):
             results[result.sweep, run.name] = result
             keep_curve(run, settings.record)
             write_record(settings.record, results.values())

@@ -94,10 +94,16 @@ def test_ppo_stands_beside_every_limit():
     assert cells(alone, "algorithm") == ["ppo"]
 
 
-def test_every_sweep_has_its_table():
-    first, second = tables([result(), dataclasses.replace(result(), sweep="ablation", settings="gae=0.9")])
-    assert first.title == "ablation (gae=0.9)"
-    assert second.title == "level1"
+def test_sweeps_of_one_case_are_compared_with_each_other_and_others_stand_alone():
+    ours = [result(seed=seed) for seed in range(2)]
+    ablation = dataclasses.replace(result(cost=1.5), sweep="ablation", settings="gae=0.9")
+    elsewhere = dataclasses.replace(result(cost_limit=3.0), sweep="elsewhere")
+    *others, compared = tables([ablation, *ours, result("cpo"), elsewhere])
+    assert [table.title for table in others] == ["elsewhere", "level1"]
+    assert compared.title == "lagnet at d = 1.0"
+    assert cells(compared, "sweep") == ["level1", "ablation"]
+    assert cells(compared, "seeds") == ["2", "1"]
+    assert cells(compared, "settings") == ["", "gae=0.9"]
 
 
 def test_the_record_reads_back(tmp_path):
