@@ -91,6 +91,10 @@ class Config:
     rescale: Literal["mean", "state"] | None = None
     """lagnet, lagnet-foresight: divide eq. 14 by 1 + mean λ, or each state's term by 1 + λ_ξ(s) σ_c. Not set:
     "mean" for lagnet, "state" for lagnet-foresight."""
+    policy_step: Literal["adam", "trust-region"] | None = None
+    """lagnet, lagnet-foresight: how the policy ascends eq. 14: by PPO's passes of Adam over minibatches, or
+    once an epoch by TRPO's natural-gradient step. Not set: "adam" for lagnet, "trust-region" for
+    lagnet-foresight."""
     limit_share: float = 1.0
     """lagnet, lagnet-foresight: share of the cost limit that the multiplier aims at; below 1, a run whose
     cost still swings about its aim ends within the limit."""
@@ -109,10 +113,10 @@ class Config:
     """lagnet-foresight: Adam's step size for the regression of C̄_ξ."""
     foresight_passes: int = 5
     """lagnet-foresight: passes of that regression over an epoch (at most `passes`)."""
-    statewise: bool = True
-    """lagnet-foresight: whether λ differs between states; if not, each takes the mean (an ablation)."""
-    scale_init: float = 30.0
-    """lagnet-foresight: the value the scale β starts at; λ_ξ(s) = β C̄_ξ(s)."""
+    foresight_power: float = 0.5
+    """lagnet-foresight: p of λ_ξ(s) = β C̄_ξ(s)^p; 0 makes λ the same in every state."""
+    scale_init: float = 3.0
+    """lagnet-foresight: the value the scale β starts at."""
     scale_gain: float = 0.08
     """lagnet-foresight: log β moves by this much an epoch for each unit of episode cost above d."""
     scale_step: float = 0.05
@@ -139,13 +143,13 @@ class Config:
     ipo_kappa: float = 0.01
     """ipo: κ of OmniSafe's penalty κ / (d − J_c)."""
     trust_kl: float = 0.01
-    """trpo-lag, cpo, scpo: radius δ of the trust region, as a KL divergence."""
+    """trpo-lag, cpo, scpo, lagnet-foresight: radius δ of the trust region, as a KL divergence."""
     cg_iterations: int = 15
-    """trpo-lag, cpo, scpo: iterations of conjugate gradients."""
+    """trpo-lag, cpo, scpo, lagnet-foresight: iterations of conjugate gradients."""
     damping: float = 0.1
-    """trpo-lag, cpo, scpo: multiple of the identity added to the Fisher matrix."""
+    """trpo-lag, cpo, scpo, lagnet-foresight: multiple of the identity added to the Fisher matrix."""
     fisher_every: int = 4
-    """trpo-lag, cpo, scpo: every how-many-th sample goes into the Fisher products."""
+    """trpo-lag, cpo, scpo, lagnet-foresight: every how-many-th sample goes into the Fisher products."""
     cpo_form: Literal["paper", "omnisafe"] = "paper"
     """cpo, scpo: the step as the paper derives it, or with OmniSafe's sign and unit of the constraint."""
 
@@ -189,8 +193,8 @@ _POSITIVE = (
     "ipo_sharpness", "ipo_kappa", "trust_kl", "cg_iterations", "fisher_every",
 )  # fmt: skip
 _NOT_NEGATIVE = (
-    "cost_limit", "seed", "entropy", "nearness", "saturation", "critic_l2", "multiplier_init", "scale_gain",
-    "dual_init", "pid_kp", "pid_ki", "pid_kd", "damping",
+    "cost_limit", "seed", "entropy", "nearness", "saturation", "critic_l2", "multiplier_init",
+    "foresight_power", "scale_gain", "dual_init", "pid_kp", "pid_ki", "pid_kd", "damping",
 )  # fmt: skip
 _FRACTION = ("discount", "cost_discount", "gae", "cost_gae", "foresight", "pid_smoothing")
 

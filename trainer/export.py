@@ -119,7 +119,9 @@ class TrainedRun:
         if network is None:
             return policy, onnx_graph.constant_graph(len(features.normaliser.mean), NO_NETWORK)
         xi = network.parameters.detach().numpy()
-        multiplier = onnx_graph.multiplier_graph(xi, learner.critic_shape, features, network.scale)
+        multiplier = onnx_graph.multiplier_graph(
+            xi, learner.critic_shape, features, network.scale, network.power
+        )
         return policy, multiplier
 
 

@@ -211,14 +211,15 @@ def policy_graph(theta: Floats, shape: Shape, features: Features, actions: Actio
     return builder.model(len(features.normaliser.mean), "action", ["batch", shape.outputs])
 
 
-def multiplier_graph(theta: Floats, shape: Shape, features: Features, scale: float) -> bytes:
-    """Observation [batch, n] → multiplier [batch]: scale · softplus(f_ξ(s)).
+def multiplier_graph(theta: Floats, shape: Shape, features: Features, scale: float, power: float) -> bytes:
+    """Observation [batch, n] → multiplier [batch]: scale · softplus(f_ξ(s))^power.
 
     Args:
         theta: the multiplier network's parameters [P].
         shape: its layer sizes.
         features: what it sees.
-        scale: what the softplus is multiplied by.
+        scale: what the power is multiplied by.
+        power: what the softplus is raised to.
 
     Returns:
         The file's bytes.
@@ -226,6 +227,7 @@ def multiplier_graph(theta: Floats, shape: Shape, features: Features, scale: flo
     builder = _Builder()
     builder.network(theta, shape, features)
     builder.node("Softplus")
+    builder.node("Pow", builder.constant(power))
     builder.node("Mul", builder.constant(scale))
     builder.node("Squeeze", builder.constant([1], np.int64), output="multiplier")
     return builder.model(len(features.normaliser.mean), "multiplier", ["batch"])

@@ -1,4 +1,4 @@
-"""What the trust-region algorithms share: Fisher products, conjugate gradients, the line search."""
+"""What trust-region algorithms share: Fisher products, conjugate gradients, line search, TRPO's step."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -6,10 +6,20 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from trainer.critics import check_finite
 from trainer.learner import Batch, Learner
 from trainer.networks import kl_divergence, log_probability, mlp
 
 Product = Callable[[Tensor], Tensor]
+Objective = Callable[[Tensor], Tensor]
+"""Ratio r = π_θ(a|s) / π_old(a|s) [B] → scalar to maximise."""
+TRIES = 15
+"""Shares of TRPO's step that the line search tries."""
+
+
+def expected(advantage: Tensor) -> Objective:
+    """E[r A] for an advantage [B]."""
+    return lambda ratio: (ratio * advantage).mean()
 
 
 def fisher(learner: Learner, batch: Batch) -> Product:
@@ -71,26 +81,26 @@ def conjugate_gradient(product: Product, b: Tensor, iterations: int, tolerance: 
 
 @dataclass(frozen=True)
 class Surrogates:
-    """First-order models of return and cost around the acting policy.
+    """What is known of a policy near the acting one.
 
     Attributes:
-        reward: E[r A].
+        objective: what is maximised.
         cost: E[r A_c].
         divergence: KL(old ‖ new).
     """
 
-    reward: Tensor
+    objective: Tensor
     cost: Tensor
     divergence: Tensor
 
 
-def surrogates(learner: Learner, batch: Batch, advantage: Tensor) -> Surrogates:
+def surrogates(learner: Learner, batch: Batch, objective: Objective) -> Surrogates:
     """The surrogates at the learner's present actor.
 
     Args:
         learner: whose actor it is.
         batch: the epoch.
-        advantage: A, of the reward or a combination [B].
+        objective: of the ratio.
 
     Returns:
         Scalars, with a graph if gradients are enabled.
@@ -98,7 +108,7 @@ def surrogates(learner: Learner, batch: Batch, advantage: Tensor) -> Surrogates:
     mean, log_std = learner.policy(batch.observation)
     ratio = (log_probability(mean, log_std, batch.action) - batch.log_prob).exp()
     return Surrogates(
-        reward=(ratio * advantage).mean(),
+        objective=objective(ratio),
         cost=(ratio * batch.cost_advantage).mean(),
         divergence=kl_divergence(batch.mean, batch.log_std, mean, log_std),
     )
@@ -107,7 +117,7 @@ def surrogates(learner: Learner, batch: Batch, advantage: Tensor) -> Surrogates:
 def line_search(
     learner: Learner,
     batch: Batch,
-    advantage: Tensor,
+    objective: Objective,
     step: Tensor,
     accept: Callable[[Surrogates], bool],
     tries: int,
@@ -117,7 +127,7 @@ def line_search(
     Args:
         learner: whose actor moves.
         batch: the epoch.
-        advantage: A of the surrogates [B].
+        objective: of the surrogates.
         step: the full step [P].
         accept: judges the surrogates at a candidate.
         tries: of shares of the step.
@@ -130,9 +140,40 @@ def line_search(
     with torch.no_grad():
         for _ in range(tries):
             learner.actor.copy_(start + share * step)
-            found = surrogates(learner, batch, advantage)
+            found = surrogates(learner, batch, objective)
             if accept(found):
                 return share, float(found.divergence)
             share *= 0.8
         learner.actor.copy_(start)
     return 0.0, 0.0
+
+
+def trust_region_step(learner: Learner, batch: Batch, objective: Objective) -> dict[str, float]:
+    """TRPO's step √(2δ / xᵀHx) x with H x = g, shortened until the objective rises within the trust region.
+
+    Args:
+        learner: whose actor moves.
+        batch: the epoch.
+        objective: of the ratio; g is its gradient.
+
+    Returns:
+        Loss before the step, share of the step taken and divergence.
+
+    Raises:
+        NonFiniteError: if the objective or the step is not finite.
+    """
+    config = learner.config
+    start = surrogates(learner, batch, objective).objective
+    (g,) = torch.autograd.grad(start, learner.actor)
+    before = start.item()
+    product = fisher(learner, batch)
+    x = conjugate_gradient(product, g, config.cg_iterations)
+    curvature = x @ product(x)
+    step = (2 * config.trust_kl / (curvature + 1e-8)).sqrt() * x
+    check_finite({"policy surrogate": before, "trust-region step": float(step.sum())})
+
+    def accept(found: Surrogates) -> bool:
+        return bool(found.objective >= before) and bool(found.divergence <= config.trust_kl)
+
+    share, kl = line_search(learner, batch, objective, step, accept, TRIES)
+    return {"policy_loss": -before, "step_share": share, "kl": kl}

@@ -196,10 +196,15 @@ def test_lagnet_foresight_regresses_the_cost_ahead_and_scales_it():
         learner.config.scale_init * np.exp(learner.config.scale_step)
     )  # 10 × mean cost > d
     x = batch.observation[:3]
-    torch.testing.assert_close(rule.network(x), logged["scale"] * rule.network.raw(x))
+    torch.testing.assert_close(rule.network(x), logged["scale"] * rule.network.raw(x).sqrt())
 
 
-@pytest.mark.parametrize("algorithm", ["trpo-lag", "cpo", "scpo"])
+def test_lagnet_foresight_has_one_multiplier_for_all_states_at_power_0():
+    rule, _, batch, _ = make("lagnet-foresight", foresight_power=0.0, scale_init=2.5)
+    assert torch.equal(rule.network(batch.observation), torch.full((T * N,), 2.5))
+
+
+@pytest.mark.parametrize("algorithm", ["trpo-lag", "cpo", "scpo", "lagnet-foresight"])
 def test_trust_region_steps_stay_in_the_trust_region(algorithm):
     rule, learner, batch, figures = make(algorithm, cost_limit=3.9)
     before = learner.actor.detach().clone()
@@ -209,24 +214,51 @@ def test_trust_region_steps_stay_in_the_trust_region(algorithm):
     assert not torch.equal(before, learner.actor.detach())
 
 
-def test_trpo_takes_the_natural_gradient_step():
-    rule, learner, batch, figures = make("trpo-lag", fisher_every=1, cg_iterations=60)
-    start = learner.actor.detach().clone()
+def trpo_lag_objective(batch, ratio, rule):
     multiplier = 0.001 + 0.035
-    advantage = (batch.reward_advantage - multiplier * batch.cost_advantage) / (1 + multiplier)
+    return (ratio * (batch.reward_advantage - multiplier * batch.cost_advantage)).mean() / (1 + multiplier)
+
+
+def foresight_objective(batch, ratio, rule):
+    """Eq. 14 where the clip is idle, each term divided by 1 + λ(s) σ_c, λ as the update has left it."""
+    multiplier = rule.network(batch.observation).detach()
+    terms = ratio * (batch.reward_advantage - multiplier * batch.cost_advantage)
+    return (terms / (1 + multiplier * batch.cost_advantage.std())).mean()
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "objective"),
+    [("trpo-lag", trpo_lag_objective), ("lagnet-foresight", foresight_objective)],
+)
+def test_the_trust_region_step_is_the_natural_gradient(algorithm, objective):
+    rule, learner, batch, figures = make(algorithm, fisher_every=1, cg_iterations=60)
+    start = learner.actor.detach().clone()
     reference = Reference(learner)
-    (reference.ratio(batch) * advantage).mean().backward()
+    ratio = reference.ratio(batch)
+    product = fisher_by_jacobian(learner, batch)
+    rule.update(batch, figures)
+    objective(batch, ratio, rule).backward()
     layers = reference.net[::2]
     g = torch.cat(
         [x for k in layers for x in (k.weight.grad.T.reshape(-1), k.bias.grad)] + [reference.log_std.grad]
     )
-    product = fisher_by_jacobian(learner, batch)
-    rule.update(batch, figures)
     step = learner.actor.detach() - start
     x = step / step.norm()
     image = product(x.double())
     cosine = (image @ g.double()) / (image.norm() * g.double().norm())  # H x is parallel to g
     assert cosine > 0.999
+
+
+def test_lagnet_foresight_can_ascend_by_adam():
+    rule, learner, batch, figures = make("lagnet-foresight", policy_step="adam")
+    reference = Reference(learner)
+    ratio = reference.ratio(batch)
+    rule.update(batch, figures)
+    multiplier = rule.network(batch.observation).detach()
+    weight = 1 / (1 + multiplier * batch.cost_advantage.std())
+    penalty = (weight * multiplier * ratio * batch.cost_advantage).mean()
+    want = reference.descend(-clipped(ratio, weight * batch.reward_advantage) + penalty)
+    torch.testing.assert_close(learner.actor.detach(), want, atol=2e-6, rtol=0)
 
 
 def fisher_by_jacobian(learner, batch):

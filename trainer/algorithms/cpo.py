@@ -11,7 +11,14 @@ from trainer.algorithms.base import Algorithm
 from trainer.critics import check_finite, fit_critics
 from trainer.learner import Batch, Learner
 from trainer.rollout import Figures
-from trainer.trust_region import Surrogates, conjugate_gradient, fisher, line_search, surrogates
+from trainer.trust_region import (
+    Surrogates,
+    conjugate_gradient,
+    expected,
+    fisher,
+    line_search,
+    surrogates,
+)
 
 LINE_SEARCH = 20
 TINY = 1e-8
@@ -137,10 +144,11 @@ def cpo_update(learner: Learner, batch: Batch, excess: float) -> dict[str, float
     config = learner.config
     paper = config.cpo_form == "paper"
     c = excess / config.episode_decisions if paper else excess
-    before = surrogates(learner, batch, batch.reward_advantage)
-    (g,) = torch.autograd.grad(before.reward, learner.actor, retain_graph=True)
+    objective = expected(batch.reward_advantage)
+    before = surrogates(learner, batch, objective)
+    (g,) = torch.autograd.grad(before.objective, learner.actor, retain_graph=True)
     (b,) = torch.autograd.grad(before.cost, learner.actor)
-    reward, cost = before.reward.item(), before.cost.item()
+    reward, cost = before.objective.item(), before.cost.item()
     product = fisher(learner, batch)
     x = conjugate_gradient(product, g, config.cg_iterations)
     p = conjugate_gradient(product, b, config.cg_iterations)
@@ -164,11 +172,11 @@ def cpo_update(learner: Learner, batch: Batch, excess: float) -> dict[str, float
     case = problem.case
 
     def accept(found: Surrogates) -> bool:
-        improved = case <= Case.INFEASIBLE or bool(found.reward >= reward)
+        improved = case <= Case.INFEASIBLE or bool(found.objective >= reward)
         cheaper = bool(found.cost - cost <= max(-c, 0.0))
         return improved and cheaper and bool(found.divergence <= config.trust_kl)
 
-    share, kl = line_search(learner, batch, batch.reward_advantage, step, accept, LINE_SEARCH)
+    share, kl = line_search(learner, batch, objective, step, accept, LINE_SEARCH)
     multiplier = -along_p / along_x if along_x else 0.0
     return {
         "multiplier": multiplier,

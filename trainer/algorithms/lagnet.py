@@ -8,15 +8,21 @@ from torch import Tensor
 from trainer.algorithms.base import Algorithm
 from trainer.algorithms.multiplier import MultiplierNetwork
 from trainer.algorithms.ppo import proximal_update
+from trainer.critics import fit_critics
 from trainer.learner import Batch, Learner
 from trainer.losses import clipped_surrogate, cost_surrogate, multiplier_loss
 from trainer.rollout import Figures
+from trainer.trust_region import trust_region_step
 
 
 def statewise_update(
-    learner: Learner, batch: Batch, multiplier: Tensor, rescale: Literal["mean", "state"]
+    learner: Learner,
+    batch: Batch,
+    multiplier: Tensor,
+    rescale: Literal["mean", "state"],
+    step: Literal["adam", "trust-region"],
 ) -> dict[str, float]:
-    """proximal_update with eq. 14, rescaled.
+    """The policy's ascent on eq. 14, rescaled, beside the critics' regression.
 
     Args:
         learner: whose actor and critics move.
@@ -26,6 +32,7 @@ def statewise_update(
             gradient clip does); "state" divides each state's term by its own 1 + λ_ξ(s) σ_c, with σ_c the
             deviation of A_c (that of A is 1): this keeps the best action of every state, and keeps the few
             states of large λ from deciding the whole step.
+        step: passes of Adam over minibatches as in PPO, or one natural-gradient step as in TRPO.
 
     Returns:
         Figures to log.
@@ -42,7 +49,12 @@ def statewise_update(
         cost = cost_surrogate(ratio, batch.cost_advantage[block], penalty[block])
         return clipped_surrogate(ratio, advantage[block], clip) + cost
 
-    return proximal_update(learner, batch, loss)
+    if step == "adam":
+        return proximal_update(learner, batch, loss)
+    return learner.side_by_side(
+        lambda: trust_region_step(learner, batch, lambda ratio: -loss(ratio, slice(None))),
+        lambda: fit_critics(learner, batch),
+    )
 
 
 class Lagnet(Algorithm):
@@ -62,7 +74,9 @@ class Lagnet(Algorithm):
             "multiplier": float(multiplier.mean()),
             "multiplier_max": float(multiplier.max()),
             "multiplier_loss": ascent,
-        } | statewise_update(self.learner, batch, multiplier, self.config.rescale or "mean")
+        } | statewise_update(
+            self.learner, batch, multiplier, self.config.rescale or "mean", self.config.policy_step or "adam"
+        )
 
     def _ascend(self, batch: Batch) -> float:
         """Passes of minibatch ascent on eq. 15; returns the mean loss of the last one."""

@@ -1,9 +1,11 @@
 """Lagnet with foresight: eq. 14 with a multiplier that knows what is coming.
 
-Eq. 15 is linear in λ: its optimum in each state is 0 or infinity. With a quadratic penalty,
-max E[λ (C̄ − w) − κ λ² / 2], the optimum is bounded, λ(s) = [C̄(s) − w]₊ / κ. Here C̄(s) is the discounted cost
-of the next moments, regressed by a network, so that λ rises on the approach and not only inside a hazard; and
-the one scale β = 1/κ is moved until the episode cost meets its limit. λ_ξ(s) = β C̄_ξ(s).
+Eq. 15 is linear in λ: its optimum in each state is 0 or infinity. With a penalty of a power q above 1,
+max E[λ (C̄ − w) − κ λ^q / q], the optimum is bounded: λ(s) = ([C̄(s) − w]₊ / κ)^p with p = 1 / (q − 1). Here
+C̄(s) is the discounted cost of the next moments, regressed by a network, so that λ rises on the approach and
+not only inside a hazard; and the one scale β = κ^−p is moved until the episode cost meets its limit:
+λ_ξ(s) = β C̄_ξ(s)^p. A cubic penalty, p = ½, lies between one λ for all states and the quadratic one, whose λ
+grows so steeply before a hazard that a policy may rather stand still.
 """
 
 import math
@@ -21,13 +23,14 @@ from trainer.rollout import Figures
 
 
 class LagnetForesight(Algorithm):
-    """The policy maximises eq. 14 with λ_ξ(s) = β C̄_ξ(s); C̄_ξ is regressed, β follows the episode cost."""
+    """The policy maximises eq. 14 with λ_ξ(s) = β C̄_ξ(s)^p; C̄_ξ is regressed, β follows the episode cost."""
 
     def __init__(self, learner: Learner) -> None:
         super().__init__(learner)
         config = self.config
         self.network = MultiplierNetwork(learner, config.foresight_init, config.foresight_learning_rate)
         self.network.scale = config.scale_init
+        self.network.power = config.foresight_power
 
     def update(self, batch: Batch, figures: Figures) -> dict[str, float]:
         """One update on one epoch, see Algorithm.update."""
@@ -42,14 +45,14 @@ class LagnetForesight(Algorithm):
         loss = self._regress(batch)
         with torch.no_grad():
             multiplier = self.network(batch.observation)
-        if not config.statewise:
-            multiplier = multiplier.mean().expand_as(multiplier)
         return {
             "multiplier": float(multiplier.mean()),
             "multiplier_max": float(multiplier.max()),
             "scale": self.network.scale,
             "multiplier_loss": loss,
-        } | statewise_update(self.learner, batch, multiplier, config.rescale or "state")
+        } | statewise_update(
+            self.learner, batch, multiplier, config.rescale or "state", config.policy_step or "trust-region"
+        )
 
     def cost_now(self, figures: Figures) -> float:
         """What an episode of the latest epoch's steps costs: without the delay of finished episodes."""

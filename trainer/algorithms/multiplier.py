@@ -13,13 +13,14 @@ from trainer.networks import fast_mlp, initial
 
 
 class MultiplierNetwork:
-    """λ_ξ(s) = scale · softplus(f_ξ(s)) ≥ 0, registered with the learner under the name "multiplier".
+    """λ_ξ(s) = scale · softplus(f_ξ(s))^power ≥ 0, registered with the learner under the name "multiplier".
 
     f_ξ's last layer starts near zero, with a bias that puts the softplus at `start` in every state.
 
     Attributes:
         parameters: ξ [P].
         scale: the factor; 1 unless an algorithm moves it.
+        power: the exponent; 1 unless an algorithm sets it.
     """
 
     def __init__(self, learner: Learner, start: float, learning_rate: float) -> None:
@@ -29,6 +30,7 @@ class MultiplierNetwork:
         xi[-1] = start + math.log(-math.expm1(-start)) if start > 0 else -20.0
         self.parameters = learner.add("multiplier", xi, learning_rate)
         self.scale = 1.0
+        self.power = 1.0
 
     def raw(self, observation: Tensor) -> Tensor:
         """softplus(f_ξ(s)) [B] for the networks' inputs [B, m]."""
@@ -36,7 +38,7 @@ class MultiplierNetwork:
 
     def __call__(self, observation: Tensor) -> Tensor:
         """λ_ξ(s) [B] for the networks' inputs [B, m]."""
-        return self.scale * self.raw(observation)
+        return self.scale * self.raw(observation) ** self.power
 
     def descend(self, schedule: list[list[slice]], loss: Callable[[slice], Tensor]) -> float:
         """Passes of minibatch descent on a loss.
