@@ -25,6 +25,8 @@ SETTINGS = {
         "limit_share": 0.9,
     },
 }
+# Both step onto the limit itself, in a linear model of a cost that is convex: they end a little beyond.
+BEYOND = {"cpo": 1.05, "scpo": 1.05}
 
 
 def learn(algorithm, tmp_path, tiny_task):
@@ -48,11 +50,11 @@ def test_ppo_ignores_the_limit(tmp_path, tiny_task):
 @pytest.mark.parametrize("algorithm", [name for name in SETTINGS if name not in {"ppo", "scpo"}])
 def test_constrained_algorithms_end_within_the_limit(algorithm, tmp_path, tiny_task):
     figures = learn(algorithm, tmp_path, tiny_task)
-    assert figures["training_cost"] <= LIMIT * 1.05
+    assert figures["training_cost"] <= LIMIT * BEYOND.get(algorithm, 1.0)
     assert 0.5 * BEST < figures["training_return"] < BEST * 1.05
 
 
 def test_scpo_limits_the_largest_cost_of_an_episode(tmp_path, tiny_task):
     figures = learn("scpo", tmp_path, tiny_task)
-    assert figures["training_constrained"] <= 0.25 * 1.05
+    assert figures["training_constrained"] <= 0.25 * BEYOND["scpo"]
     assert figures["training_return"] > 5
