@@ -27,6 +27,7 @@ from trainer.calibration import Threshold, calibrate
 from trainer.closed_loop import Episodes, episodes
 from trainer.errors import CheckpointError, ExportError, TrainerError
 from trainer.learner import Learner
+from trainer.networks import mlp
 from trainer.rollout import Inference
 from trainer.train import below, load_config, make_environments
 
@@ -89,13 +90,12 @@ class TrainedRun:
             raise CheckpointError(f"the checkpoint in {folder} does not fit its settings: {error}") from error
 
     def actions(self, observation: Floats) -> Floats:
-        """The mean action [B, a] within bounds for raw observations [B, n], by torch."""
-        with torch.no_grad():
-            mean, _ = self.learner.policy(self._inputs(observation))
-        return self.range.sent(mean.numpy())
+        """The mean action [B, a] within bounds for raw observations [B, n], by torch in double precision."""
+        actor, shape = self.learner.actor.detach(), self.learner.actor_shape
+        return self.range.sent(mlp(actor[: shape.size].double(), self._inputs(observation), shape).numpy())
 
     def multipliers(self, observation: Floats) -> Floats:
-        """λ [B] of raw observations [B, n], by torch; a constant without a multiplier network."""
+        """λ [B] of raw observations [B, n], likewise; a constant without a multiplier network."""
         network = self.algorithm.multiplier_network()
         if network is None:
             return np.full(observation.shape[0], NO_NETWORK, np.float32)
@@ -103,7 +103,7 @@ class TrainedRun:
             return np.asarray(network(self._inputs(observation)).numpy())
 
     def _inputs(self, observation: Floats) -> torch.Tensor:
-        return torch.from_numpy(self.learner.features(observation))
+        return torch.from_numpy(self.learner.features(observation, np.float64))
 
     def policy(self) -> "Inference":
         """The policy's mean for few observations at a time."""
@@ -242,8 +242,7 @@ def _level(run: TrainedRun) -> int:
 def _threshold(run: TrainedRun, played: Episodes) -> Threshold:
     if run.algorithm.multiplier_network() is None:
         return Threshold(0.0, f"gate always open: {run.config.algorithm} has no multiplier network")
-    steps, count, size = played.observation.shape
-    multiplier = run.multipliers(np.nan_to_num(played.observation.reshape(-1, size))).reshape(steps, count)
+    multiplier = np.stack([run.multipliers(row) for row in np.nan_to_num(played.observation)])
     return calibrate(multiplier, played.cost)
 
 

@@ -58,12 +58,12 @@ class Surroundings:
         """Numbers that it gives."""
         return 4 * LIDAR_BINS + 5
 
-    def __call__(self, observation: npt.NDArray[np.floating]) -> Floats:
-        """The numbers [..., size] for raw observations [..., n]."""
-        hazards = observation[..., self.hazards].astype(np.float32)
+    def __call__(self, observation: Floats) -> Floats:
+        """The numbers [..., size] for raw observations [..., n], of the same precision."""
+        hazards = observation[..., self.hazards]
         x, y, distance = _places(hazards)
-        ux, uy, away, seen = _goal(observation[..., self.goal].astype(np.float32))
-        coast = observation[..., self.velocity].astype(np.float32) * np.float32(COASTING)
+        ux, uy, away, seen = _goal(observation[..., self.goal])
+        coast = observation[..., self.velocity] * np.float32(COASTING)
         cx, cy = coast[..., :1], coast[..., 1:]
         rate, gain = np.float32(-1 / self.length), np.float32(GAIN)
         to_goal = _from_segment(x, y, ux * away, uy * away)
@@ -130,12 +130,12 @@ class Features:
         self.surroundings = surroundings
         self.size = observations + (surroundings.size if surroundings else 0)
 
-    def __call__(self, observation: npt.NDArray[np.floating]) -> Floats:
-        """Inputs [..., size] of raw observations [..., n]."""
-        normalised = self.normaliser(observation)
+    def __call__(self, observation: npt.NDArray[np.floating], dtype: type = np.float32) -> Floats:
+        """Inputs [..., size] of raw observations [..., n], computed in the precision of `dtype`."""
+        normalised = self.normaliser(observation, dtype)
         if self.surroundings is None:
             return normalised
-        return np.concatenate([normalised, self.surroundings(observation)], axis=-1)
+        return np.concatenate([normalised, self.surroundings(observation.astype(dtype))], axis=-1)
 
 
 def surroundings(config: Config) -> Surroundings | None:

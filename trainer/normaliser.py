@@ -43,10 +43,12 @@ class Normaliser:
         std = np.maximum(np.sqrt(self.variance), SMALLEST_STD)
         return self.mean.astype(np.float32), (1.0 / std).astype(np.float32)
 
-    def __call__(self, observation: npt.NDArray[np.floating]) -> npt.NDArray[np.float32]:
-        """Normalises observations [..., n] to float32 within ±5."""
+    def __call__(
+        self, observation: npt.NDArray[np.floating], dtype: type = np.float32
+    ) -> npt.NDArray[np.float32]:
+        """Normalises observations [..., n] to within ±5, computed in the precision of `dtype`."""
         mean, inverse = self.scale()
-        z: npt.NDArray[np.float32] = np.subtract(observation, mean, dtype=np.float32)
+        z: npt.NDArray[np.float32] = np.subtract(observation, mean, dtype=dtype)
         np.multiply(z, inverse, out=z)
         np.clip(z, -CLIP, CLIP, out=z)
         return z

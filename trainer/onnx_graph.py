@@ -16,21 +16,34 @@ from trainer.networks import HIDDEN, Shape
 from trainer.normaliser import CLIP
 
 OPSET = 17
+SENSED = "sensed"
+"""The observation in double precision."""
 IR_VERSION = 8
 Floats = npt.NDArray[np.float32]
 
 
 class _Builder:
-    """Collects nodes and constants of a graph; a node takes the last one's output."""
+    """Collects nodes and constants of a graph; a node takes the last one's output.
+
+    Numbers are rounded to float32 as the networks' are, arithmetic is float64: the way out of the dead zone
+    is so steep that rounding on the way to it would show in the action.
+    """
 
     def __init__(self) -> None:
         self.nodes: list[onnx.NodeProto] = []
         self.constants: list[onnx.TensorProto] = []
         self.last = "observation"
+        self.node("Cast", output=SENSED, to=TensorProto.DOUBLE)
 
-    def constant(self, value: npt.ArrayLike, kind: type = np.float32) -> str:
+    def constant(self, value: npt.ArrayLike) -> str:
+        return self._keep(np.asarray(value, np.float32).astype(np.float64))
+
+    def integers(self, value: npt.ArrayLike) -> str:
+        return self._keep(np.asarray(value, np.int64))
+
+    def _keep(self, value: npt.NDArray[np.generic]) -> str:
         name = f"c{len(self.constants)}"
-        self.constants.append(numpy_helper.from_array(np.asarray(value, kind), name))
+        self.constants.append(numpy_helper.from_array(value, name))
         return name
 
     def node(
@@ -44,15 +57,15 @@ class _Builder:
 
     def columns(self, where: slice) -> str:
         """Numbers of the observation [batch, k]."""
-        self.last = "observation"
-        self.node("Slice", *(self.constant([k], np.int64) for k in (where.start, where.stop, 1)))
+        self.last = SENSED
+        self.node("Slice", *(self.integers([k]) for k in (where.start, where.stop, 1)))
         return self.last
 
     def rolled(self, bins: str, shift: int) -> str:
         """Of each bin, the number of the bin `shift` before it."""
         self.last = bins
         order = (np.arange(LIDAR_BINS) - shift) % LIDAR_BINS
-        self.node("Gather", self.constant(order, np.int64), axis=1)
+        self.node("Gather", self.integers(order), axis=1)
         return self.last
 
     def chain(self, start: str, *steps: tuple[str, ...]) -> str:
@@ -112,8 +125,8 @@ class _Builder:
 
     def map(self, length: float, along: str, left: str, distance: str) -> str:
         """features.Surroundings._map."""
-        angle = np.arange(LIDAR_BINS) * BIN_WIDTH
-        last, sharpness = self.constant([2], np.int64), self.constant(SHARPNESS)
+        angle = np.arange(LIDAR_BINS, dtype=np.float32) * np.float32(BIN_WIDTH)
+        last, sharpness = self.integers([2]), self.constant(SHARPNESS)
         ratio = self.chain(distance, ("Max", self.constant(TINY)), ("Reciprocal",), ("Mul", sharpness))
         ahead = self.chain(along, ("Mul", ratio), ("Unsqueeze", last), ("Mul", self.constant(np.cos(angle))))
         cosine = self.chain(
@@ -152,7 +165,7 @@ class _Builder:
         """The networks' inputs, see features.Features."""
         mean, inverse = features.normaliser.scale()
         others = [] if features.surroundings is None else self.surroundings(features.surroundings)
-        self.last = "observation"
+        self.last = SENSED
         self.node("Sub", self.constant(mean))
         self.node("Mul", self.constant(inverse))
         self.node("Clip", self.constant(-CLIP), self.constant(CLIP))
@@ -170,6 +183,7 @@ class _Builder:
                 self.node("Tanh")
 
     def model(self, inputs: int, output: str, output_shape: list[str | int]) -> bytes:
+        self.node("Cast", output=output, to=TensorProto.FLOAT)
         graph = helper.make_graph(
             self.nodes,
             "lagnet",
@@ -207,7 +221,7 @@ def policy_graph(theta: Floats, shape: Shape, features: Features, actions: Actio
     jump = builder.chain(drawn, ("Mul", builder.constant(1 / RAMP)), clip, ("Mul", dead))
     builder.chain(drawn, ("Mul", builder.constant(actions.unit)), ("Add", jump))
     builder.node("Max", builder.constant(actions.low))
-    builder.node("Min", builder.constant(actions.high), output="action")
+    builder.node("Min", builder.constant(actions.high))
     return builder.model(len(features.normaliser.mean), "action", ["batch", shape.outputs])
 
 
@@ -226,17 +240,20 @@ def multiplier_graph(theta: Floats, shape: Shape, features: Features, scale: flo
     """
     builder = _Builder()
     builder.network(theta, shape, features)
-    builder.node("Softplus")
+    # onnxruntime has no Softplus for float64: max(x, 0) + log(1 + exp(−|x|)).
+    x, one = builder.last, builder.constant(1.0)
+    rest = builder.chain(x, ("Abs",), ("Neg",), ("Exp",), ("Add", one), ("Log",))
+    builder.chain(x, ("Max", builder.constant(0.0)), ("Add", rest))
     builder.node("Pow", builder.constant(power))
     builder.node("Mul", builder.constant(scale))
-    builder.node("Squeeze", builder.constant([1], np.int64), output="multiplier")
+    builder.node("Squeeze", builder.integers([1]))
     return builder.model(len(features.normaliser.mean), "multiplier", ["batch"])
 
 
 def constant_graph(inputs: int, value: float) -> bytes:
     """Observation [batch, n] → multiplier [batch]: the same value in every state."""
     builder = _Builder()
-    builder.node("ReduceSum", builder.constant([1], np.int64), keepdims=0)
+    builder.node("ReduceSum", builder.integers([1]), keepdims=0)
     builder.node("Mul", builder.constant(0.0))
-    builder.node("Add", builder.constant(value), output="multiplier")
+    builder.node("Add", builder.constant(value))
     return builder.model(inputs, "multiplier", ["batch"])

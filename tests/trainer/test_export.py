@@ -62,6 +62,16 @@ def test_the_graphs_compute_what_torch_computes(run, bundle):
     assert (trained.multipliers(observation) >= 0).all()
 
 
+def test_the_graphs_are_exact_for_a_policy_that_reacts_steeply(run):
+    trained = TrainedRun(run)
+    with torch.no_grad():
+        trained.learner.actor.mul_(5)
+    rng = np.random.default_rng(0)
+    observation = rng.normal(0, 3, (1000, 60)).astype(np.float32)
+    observation[:, 12:] = rng.random((1000, 48))
+    assert export.compare(trained, *trained.graphs(), observation)["onnx_difference_action"] < 1e-6
+
+
 def test_graphs_that_differ_are_refused(run, tmp_path, monkeypatch):
     honest = TrainedRun.graphs
 

@@ -124,9 +124,10 @@ def test_the_onnx_graph_sees_what_the_networks_see():
     graph = policy_graph(theta, shape, features, actions)
     session = onnxruntime.InferenceSession(graph, providers=["CPUExecutionProvider"])
     (computed,) = session.run(["action"], {"observation": observation})
-    expected = actions.sent(Inference(np.append(theta, [0, 0]), shape)(features(observation)))
+    exact = Inference(np.append(theta, [0, 0]).astype(np.float64), shape)
+    expected = actions.sent(exact(features(observation, np.float64)))
     assert np.abs(expected).min() < 0.01 < np.abs(expected).max()
-    np.testing.assert_allclose(computed, expected, atol=2e-5)
+    np.testing.assert_allclose(computed, expected, atol=1e-6)
 
 
 def test_surroundings_can_be_left_out():

@@ -34,7 +34,8 @@ class MultiplierNetwork:
 
     def raw(self, observation: Tensor) -> Tensor:
         """softplus(f_ξ(s)) [B] for the networks' inputs [B, m]."""
-        return softplus(fast_mlp(self.parameters, observation, self._shape)[:, 0])
+        parameters = self.parameters.to(observation.dtype)
+        return softplus(fast_mlp(parameters, observation, self._shape)[:, 0])
 
     def __call__(self, observation: Tensor) -> Tensor:
         """λ_ξ(s) [B] for the networks' inputs [B, m]."""
