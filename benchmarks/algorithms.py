@@ -301,7 +301,7 @@ def main() -> None:
     """Evaluate what is new, and print the tables."""
     settings = tyro.cli(Comparison, description=Comparison.__doc__)
     console = Console()
-    wide = Console(width=max(console.width, 160))
+    wide = Console(width=max(console.width, 200))
     results = {(result.sweep, result.run): result for result in read_record(settings.record)}
     runs = [(folder.name, run) for folder in settings.folders for run in finished_runs(folder)]
     new = [run for sweep, run in runs if (sweep, run.name) not in results]
