@@ -81,7 +81,8 @@ class Config:
     """Largest size of each action that the policy uses, which is also its unit. Not set: 0.05 for the point
     robot's thrust, which saturates there, and 1 for its turning; the task's bounds elsewhere."""
     saturation: float = 0.05
-    """Weight of the squared excess of the policy's mean over the action range, which keeps it exploring."""
+    """Weight, in PPO's objective, of the squared excess of the policy's mean over the action range: keeps it
+    exploring."""
     initial_log_std: float = 0.0
     """Initial log standard deviation of the policy's actions."""
     final_log_std: float = -2.0
