@@ -243,8 +243,7 @@ def _comparison(sweep: str, results: Sequence[Result]) -> Table:
             # An algorithm that knows no limit is the same beside every limit.
             if result.cost_limit == limit or result.algorithm in UNLIMITED:
                 groups[result.algorithm].append(result)
-        for name in sorted(groups, key=lambda name: _rank(groups[name], limit)):
-            table.add_row(str(limit), name, *_row(groups[name], limit))
+        _add_rows(table, groups, limit, str(limit))
         table.add_section()
     return table
 
@@ -254,9 +253,14 @@ def _variants(algorithm: str, limit: float, results: Sequence[Result]) -> Table:
     groups: dict[str, list[Result]] = defaultdict(list)
     for result in results:
         groups[result.sweep].append(result)
-    for name in sorted(groups, key=lambda name: _rank(groups[name], limit)):
-        table.add_row(name, *_row(groups[name], limit))
+    _add_rows(table, groups, limit)
     return table
+
+
+def _add_rows(table: Table, groups: dict[str, list[Result]], limit: float, *first: str) -> None:
+    """A row for each group, by rank; its cells before the group's name are `first`."""
+    for name in sorted(groups, key=lambda name: _rank(groups[name], limit)):
+        table.add_row(*first, name, *_row(groups[name], limit))
 
 
 def _table(title: str, *names: str) -> Table:

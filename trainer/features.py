@@ -18,6 +18,8 @@ SHARPNESS = 12.0
 """Concentration of the map's directions: a hazard shows in those within about 1/√12 rad of its own."""
 TINY = 1e-6
 Floats = npt.NDArray[np.float32]
+DIRECTIONS: Floats = np.arange(LIDAR_BINS, dtype=np.float32) * np.float32(BIN_WIDTH)
+"""The map's directions from the goal's, counter-clockwise [rad]."""
 
 
 @dataclass(frozen=True)
@@ -78,9 +80,9 @@ class Surroundings:
 
     def _map(self, along: Floats, left: Floats, distance: Floats) -> Floats:
         """Number 4, from the hazards' places in the frame of the goal [..., bins]."""
-        angle = np.arange(LIDAR_BINS, dtype=np.float32) * np.float32(BIN_WIDTH)
         ratio = np.float32(SHARPNESS) / np.maximum(distance, np.float32(TINY))
-        cosine = (ratio * along)[..., None] * np.cos(angle) + (ratio * left)[..., None] * np.sin(angle)
+        cosine = (ratio * along)[..., None] * np.cos(DIRECTIONS)
+        cosine = cosine + (ratio * left)[..., None] * np.sin(DIRECTIONS)
         level = distance * np.float32(-0.5 / self.length) - np.float32(SHARPNESS)
         shown: Floats = np.float32(GAIN) * np.exp((cosine + level[..., None]).max(-2))
         return shown

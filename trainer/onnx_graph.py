@@ -11,7 +11,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 from pointgoal.observation import BIN_WIDTH, LIDAR_BINS, LIDAR_RANGE
 from trainer.actions import RAMP, ActionRange
-from trainer.features import COASTING, GAIN, SHARPNESS, TINY, Features, Surroundings
+from trainer.features import COASTING, DIRECTIONS, GAIN, SHARPNESS, TINY, Features, Surroundings
 from trainer.networks import HIDDEN, Shape
 from trainer.normaliser import CLIP
 
@@ -125,13 +125,14 @@ class _Builder:
 
     def map(self, length: float, along: str, left: str, distance: str) -> str:
         """features.Surroundings._map."""
-        angle = np.arange(LIDAR_BINS, dtype=np.float32) * np.float32(BIN_WIDTH)
         last, sharpness = self.integers([2]), self.constant(SHARPNESS)
         ratio = self.chain(distance, ("Max", self.constant(TINY)), ("Reciprocal",), ("Mul", sharpness))
-        ahead = self.chain(along, ("Mul", ratio), ("Unsqueeze", last), ("Mul", self.constant(np.cos(angle))))
+        ahead = self.chain(
+            along, ("Mul", ratio), ("Unsqueeze", last), ("Mul", self.constant(np.cos(DIRECTIONS)))
+        )
         cosine = self.chain(
             left,
-            ("Mul", ratio), ("Unsqueeze", last), ("Mul", self.constant(np.sin(angle))), ("Add", ahead),
+            ("Mul", ratio), ("Unsqueeze", last), ("Mul", self.constant(np.sin(DIRECTIONS))), ("Add", ahead),
         )  # fmt: skip
         level = self.chain(distance, ("Mul", self.constant(-0.5 / length)), ("Sub", sharpness))
         self.chain(level, ("Unsqueeze", last), ("Add", cosine))

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from trainer.critics import check_finite
+from trainer.critics import check_finite, fit_critics
 from trainer.learner import Batch, Learner
 from trainer.networks import kl_divergence, log_probability, mlp
 
@@ -146,6 +146,17 @@ def line_search(
             share *= 0.8
         learner.actor.copy_(start)
     return 0.0, 0.0
+
+
+def trust_region_update(learner: Learner, batch: Batch, objective: Objective) -> dict[str, float]:
+    """TRPO's step up an objective of the ratio, beside the critics' regression; returns the figures of both.
+
+    Raises:
+        NonFiniteError: if a loss or the step is not finite; names it.
+    """
+    return learner.side_by_side(
+        lambda: trust_region_step(learner, batch, objective), lambda: fit_critics(learner, batch)
+    )
 
 
 def trust_region_step(learner: Learner, batch: Batch, objective: Objective) -> dict[str, float]:

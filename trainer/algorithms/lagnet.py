@@ -8,11 +8,10 @@ from torch import Tensor
 from trainer.algorithms.base import Algorithm
 from trainer.algorithms.multiplier import MultiplierNetwork
 from trainer.algorithms.ppo import proximal_update
-from trainer.critics import fit_critics
 from trainer.learner import Batch, Learner
 from trainer.losses import clipped_surrogate, cost_surrogate, multiplier_loss
 from trainer.rollout import Figures
-from trainer.trust_region import trust_region_step
+from trainer.trust_region import trust_region_update
 
 
 def statewise_update(
@@ -51,10 +50,7 @@ def statewise_update(
 
     if step == "adam":
         return proximal_update(learner, batch, loss)
-    return learner.side_by_side(
-        lambda: trust_region_step(learner, batch, lambda ratio: -loss(ratio, slice(None))),
-        lambda: fit_critics(learner, batch),
-    )
+    return trust_region_update(learner, batch, lambda ratio: -loss(ratio, slice(None)))
 
 
 class Lagnet(Algorithm):

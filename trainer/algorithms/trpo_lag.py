@@ -2,11 +2,10 @@
 
 from trainer.algorithms.base import Algorithm
 from trainer.algorithms.ppo_lag import lagrangian_advantage
-from trainer.critics import fit_critics
 from trainer.dual import AdamMultiplier, Numbers
 from trainer.learner import Batch, Learner
 from trainer.rollout import Figures
-from trainer.trust_region import expected, trust_region_step
+from trainer.trust_region import expected, trust_region_update
 
 
 class TRPOLag(Algorithm):
@@ -20,8 +19,7 @@ class TRPOLag(Algorithm):
         """One update on one epoch, see Algorithm.update."""
         multiplier = self.dual.update(self.episode_cost(figures), self.config.cost_limit)
         objective = expected(lagrangian_advantage(batch, multiplier))
-        step = trust_region_step(self.learner, batch, objective)
-        return {"multiplier": multiplier} | step | fit_critics(self.learner, batch)
+        return {"multiplier": multiplier} | trust_region_update(self.learner, batch, objective)
 
     def state(self) -> Numbers:
         """The dual's."""
