@@ -2,319 +2,176 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from decision import Decisions, Memory, Mode, Origin
+from filter import kernel, scene
 from filter.config import FilterConfig, settings
-from filter.errors import FilterInputError, SolverError
-from filter.kernel import MOST_PLAN, PASSES, PLAN, SIDE, finish, prepare
-from filter.lidar import CONES
-from filter.obstacles import COLUMNS
+from filter.programme import Programme
 from filter.qp import Problem
-from filter.result import REASONS, FilterMemory, FilterResult
-from filter.solvers import TOLERANCE, Solver, make_solver, solve_batch
-from pointgoal.observation import ObservationLayout, layout
+from filter.scene import Scene
+from filter.solvers import make_solver
+from filter.step import Step
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
+LINEARISATIONS = (False, False, True, False)
+"""Where the QP is linearised, one after the other, until its solution is certified: about the reference, about
+that solution, about the best backup's own action (True), which is feasible, about that solution."""
 _CHUNK = 512
 """Robots handled at once: bounds the memory of the obstacles."""
 
 
-@dataclass(frozen=True)
-class _Columns:
-    """Where an observation of one size has what the filter reads.
+class Guide(Protocol):
+    """Leads robots round what is in their way; `guide.Guide` is one."""
 
-    Attributes:
-        motion: velocity ahead, velocity to the left, yaw rate.
-        goal: the goal's lidar.
-        hazards: the hazards' lidar; empty at level 0, which has none.
-    """
-
-    motion: list[int]
-    goal: slice
-    hazards: slice
-
-    @staticmethod
-    def of(where: ObservationLayout) -> _Columns:
-        velocity = where.slice("velocimeter").start
-        hazards = where.slice("hazards_lidar") if "hazards_lidar" in where else slice(0, 0)
-        return _Columns(
-            [velocity, velocity + 1, where.slice("gyro").stop - 1], where.slice("goal_lidar"), hazards
-        )
-
-
-_COLUMNS = {where.size: _Columns.of(where) for where in (layout(0), layout(1))}
-
-
-@dataclass(frozen=True)
-class _Work:
-    """What passes from the building of n robots' QPs to their repair; see `kernel.prepare`."""
-
-    states: FloatArray
-    readings: FloatArray
-    obstacles: FloatArray
-    source: IntArray
-    count: IntArray
-    barrier: FloatArray
-    hazard: IntArray
-    reference: FloatArray
-    G: FloatArray
-    h: FloatArray
-    rows: IntArray
+    def propose(self, step: Step) -> tuple[IntArray, FloatArray]:
+        """The rows (n,) of the robots that are led, and the references (n, 2) in place of their actions."""
 
 
 class BarrierFilter:
     """Turns nominal actions into certified ones.
 
-    It keeps nothing between calls: what a robot's filter remembers is passed in and out, so one filter
-    serves any number of robots, and a batch of N gives what N single calls give.
+    It keeps nothing between calls: what is remembered of a robot is passed in and out, so one filter serves
+    any number of robots, and a batch of N gives what N single calls give.
+
+    Args:
+        config: the settings.
+        guide: who leads robots round what is in their way; None: nobody does.
 
     Raises:
         ValueError: if the configuration names a solver that is not installed.
     """
 
-    def __init__(self, config: FilterConfig | None = None) -> None:
+    def __init__(self, config: FilterConfig | None = None, guide: Guide | None = None) -> None:
         self.config = FilterConfig() if config is None else config
+        self.guide = guide
         self._settings = settings(self.config)
-        self._weights = np.array([self.config.thrust_weight, 1.0])
-        self._solver: Solver | None = None
-        if self.config.solver != "planar":
-            self._solver = make_solver(self.config.solver)
+        self._solver = make_solver(self.config.solver)
 
     def filter(
         self,
         observation: ArrayLike,
         nominal_action: ArrayLike,
         hazards: ArrayLike | None = None,
-        memory: FilterMemory | None = None,
+        memory: Memory | None = None,
         active: ArrayLike | None = None,
-    ) -> FilterResult:
+    ) -> Decisions:
         """Filter N actions.
 
         Args:
             observation: (N, 60), or (N, 28) at level 0.
             nominal_action: (N, 2), clipped to ±1.
             hazards: (N, n, 2) centres in the body frame, x ahead and y to the left [m]; rows of NaN are
-                absent ones. None: decode them from the lidar.
-            memory: what the last call returned, or None.
+                absent ones. What the lidar shows beside them counts as well; None or none: the lidar alone.
+            memory: (N,) of `MEMORY`, what the last call returned; None before the first.
             active: (N,) where False, the nominal action passes as it is. None: all True.
-
-        Returns:
-            The actions and what led to them.
 
         Raises:
             FilterInputError: if an input has a wrong shape or a value that is not finite.
         """
-        seen, nominal = _check_inputs(observation, nominal_action)
+        seen = scene.check_observation(observation)
         n = len(seen)
-        given = None if hazards is None else _check_hazards(hazards, n)
-        gate = np.ones(n, dtype=np.bool_) if active is None else _check_active(active, n)
-        past = np.zeros((n, 2), dtype=np.int8) if memory is None else _check_memory(memory, n)
+        nominal = scene.check_action(nominal_action, n)
+        given = scene.check_hazards(hazards, n)
+        gate = scene.check_active(active, n)
+        past = scene.check_memory(memory, n)
         parts = []
         for start in range(0, max(n, 1), _CHUNK):
             part = slice(start, start + _CHUNK)
-            hazards_part = None if given is None else given[part]
-            parts.append(self._filter(seen[part], nominal[part], hazards_part, gate[part], past[part]))
-        return FilterResult.concatenate(parts)
+            view = scene.look(self._settings, seen[part], None if given is None else given[part])
+            parts.append(self.decide(view, nominal[part], past[part], gate[part]))
+        return Decisions.join(parts)
+
+    def look(self, observation: ArrayLike, hazards: ArrayLike | None = None) -> Scene:
+        """What N robots see, and the barrier; arguments and errors as for `filter`."""
+        seen = scene.check_observation(observation)
+        return scene.look(self._settings, seen, scene.check_hazards(hazards, len(seen)))
+
+    def decide(self, view: Scene, nominal: FloatArray, memory: Memory, active: BoolArray) -> Decisions:
+        """Filter N actions for what is seen; arguments as for `filter`, all of them there and checked."""
+        step = Step(self._settings, view, nominal, memory, active)
+        least = np.full(len(nominal), self.config.hysteresis)
+        rows = np.flatnonzero(active)
+        step.certified[rows] = step.certify(rows, nominal[rows], least[rows])
+        refused = active & ~step.certified
+        led = np.zeros(len(nominal), np.bool_)
+        if self.guide is not None and rows.size:
+            rows, proposed = self.guide.propose(step)
+            step.send(rows, proposed, Mode.GUIDED, Origin.GUIDE)
+            led[rows] = True
+            refused[rows] = ~step.certify(rows, proposed, least[rows])
+        left = np.flatnonzero(refused)
+        if left.size:
+            step.blame(left)
+            left = self._by_qp(step, Programme(step, left, ~led[left]))
+            self._fall_back(step, self._by_search(step, left))
+        return step.decisions()
 
     def problem(
         self, observation: ArrayLike, nominal_action: ArrayLike, hazards: ArrayLike | None = None
     ) -> Problem | None:
-        """The QP of one robot.
+        """The first QP of one robot that has no memory; None if its nominal action passes.
 
         Args:
             observation: (60,) or (28,).
             nominal_action: (2,).
             hazards: (n, 2) in the body frame [m], or None.
 
-        Returns:
-            The QP; None where none is solved: the nominal action passes, or the detour's is certified as it
-            is.
-
         Raises:
             FilterInputError: if an input has a wrong shape or a value that is not finite.
         """
-        seen, nominal = _check_inputs(np.asarray(observation)[None], np.asarray(nominal_action)[None])
-        given = None if hazards is None else _check_hazards(np.asarray(hazards)[None], 1)
-        past = np.zeros((1, 2), dtype=np.int8)
-        work = self._prepare(seen, nominal, given, np.ones(1, dtype=np.bool_), past)
-        return self._problem(work, 0) if work.rows[0] >= 0 else None
+        view = self.look(np.asarray(observation)[None], None if hazards is None else np.asarray(hazards)[None])
+        nominal = scene.check_action(np.asarray(nominal_action)[None], 1)
+        step = Step(self._settings, view, nominal, scene.check_memory(None, 1), np.ones(1, np.bool_))
+        row = np.zeros(1, np.int64)
+        if step.certify(row, nominal, np.full(1, self.config.hysteresis))[0]:
+            return None
+        return Programme(step, row, np.ones(1, np.bool_)).problem()
 
-    def _prepare(
-        self,
-        seen: FloatArray,
-        nominal: FloatArray,
-        given: FloatArray | None,
-        active: BoolArray,
-        memory: NDArray[np.int8],
-    ) -> _Work:
-        """Build the QPs of n robots; the memory (n, 2) is overwritten."""
-        n, width = seen.shape
-        columns = _COLUMNS[width]
-        hazards = columns.hazards if given is None else slice(0, 0)
-        if given is None:
-            given = np.empty((n, 0, 2))
-        size = given.shape[1] if hazards.stop == 0 else CONES
-        states, readings = seen[:, columns.motion], np.ascontiguousarray(seen[:, hazards])
-        work = _Work(
-            states=states,
-            readings=readings,
-            obstacles=np.empty((n, size, COLUMNS)),
-            source=np.empty((n, size), dtype=np.int64),
-            count=np.empty(n, dtype=np.int64),
-            barrier=np.empty(n),
-            hazard=np.empty(n, dtype=np.int64),
-            reference=np.empty((n, 2)),
-            G=np.empty((n, size, 2)),
-            h=np.empty((n, size)),
-            rows=np.empty(n, dtype=np.int64),
-        )
-        prepare(
-            self._settings,
-            states,
-            given,
-            readings,
-            np.ascontiguousarray(seen[:, columns.goal]),
-            nominal,
-            active,
-            memory,
-            work.obstacles,
-            work.source,
-            work.count,
-            work.barrier,
-            work.hazard,
-            work.reference,
-            work.G,
-            work.h,
-            work.rows,
-        )
-        return work
+    def _by_qp(self, step: Step, programme: Programme) -> IntArray:
+        """Send the QP's own solution where it is certified; the rows that are left."""
+        for planned in LINEARISATIONS:
+            if not programme.rows.size:
+                break
+            programme.linearise(planned)
+            programme.solve(self._solver)
+            rows, action = programme.rows, programme.action()
+            done = programme.solved & step.certify(rows, action, step.need[rows])
+            for origin, which in (
+                (Origin.CIRCULATION, done & programme.circulates),
+                (Origin.BARRIER, done & ~programme.circulates),
+            ):
+                step.send(rows[which], action[which], Mode.FILTERED, origin)
+            programme.keep(~done)
+        return programme.rows
 
-    def _problem(self, work: _Work, k: int) -> Problem:
-        rows = work.rows[k]
-        return Problem(self._weights, work.reference[k], work.G[k, :rows], work.h[k, :rows])
+    def _by_search(self, step: Step, rows: IntArray) -> IntArray:
+        """Send the certified action nearest to the reference, of those that are tried; the rows left."""
+        found = step.search(rows)
+        done = step.certificates["clearance"][rows] >= step.need[rows]
+        step.send(rows[done], found[done], Mode.FILTERED, Origin.SEARCH)
+        return rows[~done]
 
-    def _solve(self, work: _Work) -> tuple[FloatArray, BoolArray]:
-        """Solve the QPs: (n, 2) solutions, the reference where there is none; (n,) where there is one."""
-        solution = work.reference.copy()
-        solved = np.zeros(len(solution), dtype=np.bool_)
-        if self._solver is None:
-            solve_batch(self._weights, work.reference, work.G, work.h, work.rows, solution, solved)
-            return solution, solved
-        for k in np.flatnonzero(work.rows >= 0):
-            problem = self._problem(work, int(k))
-            try:
-                x = self._solver(problem)
-            except SolverError:
-                continue  # the repair finds a certified action without a solution
-            # A solver's word is not enough: a solution that breaks a row counts as none.
-            if x is not None and problem.residual(x) <= TOLERANCE:
-                solution[k], solved[k] = np.clip(x, -1.0, 1.0), True
-        return solution, solved
-
-    def _filter(
-        self,
-        seen: FloatArray,
-        nominal: FloatArray,
-        given: FloatArray | None,
-        active: BoolArray,
-        memory: NDArray[np.int8],
-    ) -> FilterResult:
-        n = len(seen)
-        memory = memory.copy()
-        work = self._prepare(seen, nominal, given, active, memory)
-        action = nominal.copy()
-        mode, row, reason = np.zeros((3, n), dtype=np.int8)
-        reasons: list[str | None] = [None] * n
-        if (work.rows != PASSES).any():
-            solution, solved = self._solve(work)
-            finish(
-                self._settings,
-                work.states,
-                work.obstacles,
-                work.count,
-                work.barrier,
-                work.rows,
-                work.readings,
-                solution,
-                solved,
-                action,
-                mode,
-                row,
-                reason,
-                memory,
-            )
-            reasons = [REASONS[code] for code in reason.tolist()]
-        after = FilterMemory(memory[:, SIDE], memory[:, PLAN])
-        return FilterResult(action, mode, work.barrier, work.hazard, row, reasons, after)
-
-
-_default = BarrierFilter()
-
-
-def committed_backup(observation: ArrayLike, hazards: ArrayLike | None = None) -> FloatArray:
-    """The action (2,) that the default filter takes for one observation if the policy asks for nothing.
-
-    Args:
-        observation: (60,) or (28,).
-        hazards: (n, 2) in the body frame [m]; None: from the lidar.
-
-    Raises:
-        FilterInputError: if an input has a wrong shape or a value that is not finite.
-    """
-    given = None if hazards is None else np.asarray(hazards)[None]
-    action: FloatArray = _default.filter(np.asarray(observation)[None], np.zeros((1, 2)), given).action[0]
-    return action
-
-
-def _check_inputs(observation: ArrayLike, nominal_action: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    seen = _array("observation", observation)
-    if seen.ndim != 2 or seen.shape[1] not in _COLUMNS:
-        sizes = " or ".join(f"(N, {size})" for size in sorted(_COLUMNS, reverse=True))
-        raise FilterInputError("observation", f"expected shape {sizes}, got {seen.shape}")
-    nominal = _array("nominal_action", nominal_action)
-    if nominal.shape != (len(seen), 2):
-        raise FilterInputError("nominal_action", f"expected shape ({len(seen)}, 2), got {nominal.shape}")
-    for field, values in (("observation", seen), ("nominal_action", nominal)):
-        if not np.isfinite(values).all():
-            raise FilterInputError(field, "has values that are not finite")
-    return seen, nominal
-
-
-def _check_hazards(hazards: ArrayLike, n: int) -> FloatArray:
-    given = _array("hazards", hazards)
-    if given.ndim != 3 or given.shape[0] != n or given.shape[2] != 2:
-        raise FilterInputError("hazards", f"expected shape ({n}, n, 2), got {given.shape}")
-    finite = np.isfinite(given)
-    if not finite.all() and not (finite.all(axis=2) | np.isnan(given).all(axis=2)).all():
-        raise FilterInputError("hazards", "has values that are not finite; an absent hazard is NaN in both")
-    return given
-
-
-def _check_active(active: ArrayLike, n: int) -> BoolArray:
-    gate = np.ascontiguousarray(active, dtype=np.bool_)
-    if gate.shape != (n,):
-        raise FilterInputError("active", f"expected shape ({n},), got {gate.shape}")
-    return gate
-
-
-def _check_memory(memory: FilterMemory, n: int) -> NDArray[np.int8]:
-    if memory.side.shape != (n,) or memory.plan.shape != (n,):
-        shapes = f"{memory.side.shape} and {memory.plan.shape}"
-        raise FilterInputError("memory", f"expected that of {n} robots, got shapes {shapes}")
-    past = np.empty((n, 2), dtype=np.int8)
-    past[:, SIDE] = memory.side
-    past[:, PLAN] = np.where((memory.plan >= 0) & (memory.plan <= MOST_PLAN), memory.plan, 0)
-    return past
-
-
-def _array(field: str, values: ArrayLike) -> FloatArray:
-    try:
-        return np.ascontiguousarray(values, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise FilterInputError(field, f"is not an array of numbers: {error}") from error
+    def _fall_back(self, step: Step, rows: IntArray) -> None:
+        """Send what keeps the inner margin, else what is left of the plan, else what does the least harm."""
+        if not rows.size:
+            return
+        found, outcome = step.recover(rows)
+        kept, inside = outcome == kernel.COMMITTED, outcome == kernel.INSIDE
+        # A scan can leave places possible that the last one had ruled out, and then no backup keeps out of
+        # them all. The plan was certified against those possible then, and the hazards are among them.
+        planned = ~kept & ~inside & step.by_scan(rows) & (step.memory["left"][rows] > 0)
+        for which, origin, reason in (
+            (kept, Origin.PLAN, "no certified action: committed backup"),
+            (inside, Origin.HARM, "inside a hazard: driving out"),
+            (~kept & ~inside & ~planned, Origin.HARM, "too fast to stay clear of a hazard: least harm"),
+        ):
+            step.send(rows[which], found[which], Mode.FALLBACK, origin, reason)
+        step.forget(rows[~kept & ~planned])
+        step.go_on(rows[planned], "no certified action: the plan goes on")

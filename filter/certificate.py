@@ -6,12 +6,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from filter.backups import best_backup
-from filter.compiled import compiled
+from system.compiled import compiled
 from filter.config import Settings
-from filter.obstacles import FAR, least_gap
-from filter.robot import State, advance, stopping
+from system.obstacles import FAR, least_gap
+from system.point_robot import State, advance, stopping
 
 FloatArray = NDArray[np.float64]
+
+CERTIFICATE = np.dtype([("clearance", "f8"), ("nearest", "i8"), ("backup", "i8"), ("steps", "i8")])
+"""What a certificate says: the clearance [m], at or above 0 if there is one; the obstacle that bounds it, -1
+if none; the backup that it ends in, and for how many control steps that one thrusts."""
 
 
 @compiled

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
-from filter.robot import Robot
+import numpy as np
+from numpy.typing import NDArray
+
+from system.point_robot import ROBOT, Robot
 from pointgoal.observation import HAZARD_RADIUS
 
 MODEL_ERROR = 0.003
@@ -32,7 +35,7 @@ class FilterConfig:
     """Bound on the error of a hazard's measured bearing [rad]."""
     travel_error: float = 0.0
     """Bound on how far a backup manoeuvre strays from the model's, as a share of its way."""
-    hazard_radius: float = HAZARD_RADIUS
+    hazard_radius: float | None = None
     """Radius of every hazard [m]."""
     rate: float = 0.5
     """Share of a barrier that the QP lets one control step take away, in (0, 1]; 1 brakes last."""
@@ -42,72 +45,79 @@ class FilterConfig:
     """Clearance beyond the margin that a nominal action must leave, and a backup need not [m]."""
     thrust_weight: float = 4.0
     """Weight of a change of thrust in the QP, against 1 for a change of turn: prefer turning to braking."""
-    lookahead: float = 1.2
-    """A hazard nearer than this on the straight way to the goal is driven round [m]; 0 turns that off."""
-    clearance: float = 0.06
-    """Distance that the way round keeps from what the certificate asks for [m]."""
+    circulation: float = 0.7
+    """Share of the heading's error to the way past an obstacle that the QP's circulation row asks to be turned
+    away in a control step; 0 leaves the row out."""
     pursuit: float = 0.65
-    """How far ahead of the robot, along the way round, the stop point is steered to [m]."""
-    eagerness: float = 1.5
-    """Thrust on the way round, per cosine of the heading's error."""
-    repulsion: float = 4.0
-    """How strongly the way round leads away from a hazard that is nearer than ``clearance``."""
-    steadiness: float = 0.5
-    """Length by which the other way round must be shorter before the robot changes its mind [m]."""
+    """How far along the way past an obstacle the circulation row steers the stop point to [m]."""
+    clearance: float = 0.06
+    """Distance that the way past an obstacle keeps from what the certificate asks for [m]."""
     slow: float = 0.1
-    """A robot whose stop point is nearer than this [m] and whose nominal action is refused is led on."""
+    """A robot whose stop point is nearer than this hardly moves [m]."""
+    slow_thrust: float = 0.0
+    off_ground: float = 0.0
+    push: float = 0.3
+    rise: float = 0.0
+    w_steady: float = 0.5
+    w_turn: float = 1.0
     solver: str = "planar"
     """QP solver: "planar" (ours), "osqp" (kept workspace) or any that qpsolvers knows."""
-    robot: Robot = field(default_factory=Robot)
+    robot: Robot | None = None
     """The robot's constants."""
 
     def __post_init__(self) -> None:
         """Refuse settings that void the guarantee."""
         errors = ("margin", "position_error", "bearing_error", "travel_error")
-        shares = (*errors, "keep_off", "hysteresis")
-        for name in shares:
+        for name in (*errors, "keep_off", "hysteresis"):
             if not 0.0 <= getattr(self, name) < 1.0:
                 raise ValueError(f"{name} must be in [0, 1), got {getattr(self, name)!r}")
-        positive = ("hazard_radius", "thrust_weight", "clearance", "pursuit", "eagerness")
-        for name in positive:
-            if not 0.0 < getattr(self, name) < 100.0:
+        for name in ("hazard_radius", "thrust_weight", "pursuit"):
+            if getattr(self, name) is not None and not 0.0 < getattr(self, name) < 100.0:
                 raise ValueError(f"{name} must be in (0, 100), got {getattr(self, name)!r}")
-        for name in ("lookahead", "repulsion", "steadiness", "slow"):
+        for name in ("circulation", "slow", "clearance"):
             if not 0.0 <= getattr(self, name) < 100.0:
                 raise ValueError(f"{name} must be in [0, 100), got {getattr(self, name)!r}")
         if not 0.0 < self.rate <= 1.0:
             raise ValueError(f"rate must be in (0, 1], got {self.rate!r}")
 
 
-class Settings(NamedTuple):
-    """`FilterConfig`'s numbers as compiled code takes them; ``margin`` holds the position error as well."""
+_NUMBERS = (
+    "margin",
+    "sure",
+    "bearing_error",
+    "position_error",
+    "travel_error",
+    "hazard_radius",
+    "rate",
+    "keep_off",
+    "hysteresis",
+    "thrust_weight",
+    "circulation",
+    "pursuit",
+    "clearance",
+    "slow",
+    "slow_thrust",
+    "off_ground",
+    "push",
+    "rise",
+    "w_steady",
+    "w_turn",
+)
+SETTINGS = np.dtype([("robot", ROBOT), *((name, "f8") for name in _NUMBERS)])
+"""`FilterConfig`'s numbers as compiled code takes them: ``margin`` holds the position error as well, ``sure``
+is what is kept whatever happens. An array of one: numba passes it fifty times as fast as a tuple."""
 
-    robot: Robot
-    margin: float
-    sure: float
-    bearing_error: float
-    travel_error: float
-    hazard_radius: float
-    rate: float
-    keep_off: float
-    hysteresis: float
-    thrust_weight: float
-    lookahead: float
-    clearance: float
-    pursuit: float
-    eagerness: float
-    repulsion: float
-    steadiness: float
-    slow: float
+Settings = Any
+"""One row of `SETTINGS`, in compiled code."""
 
 
-def settings(config: FilterConfig) -> Settings:
-    """The numbers of a configuration."""
-    names = [name for name in Settings._fields if name not in ("robot", "margin", "sure")]
-    numbers = {name: float(getattr(config, name)) for name in names}
-    return Settings(
-        robot=config.robot,
-        margin=config.margin + config.position_error,
-        sure=MODEL_ERROR + config.position_error,
-        **numbers,
-    )
+def settings(config: FilterConfig) -> NDArray[np.void]:
+    """The numbers of a configuration: (1,) of `SETTINGS`."""
+    made = np.zeros(1, SETTINGS)
+    made["robot"] = tuple(config.robot or Robot())
+    made["hazard_radius"] = HAZARD_RADIUS if config.hazard_radius is None else config.hazard_radius
+    for name in set(_NUMBERS) - {"margin", "sure", "hazard_radius"}:
+        made[name] = getattr(config, name)
+    made["margin"] = config.margin + config.position_error
+    made["sure"] = MODEL_ERROR + config.position_error
+    return made

@@ -1,4 +1,8 @@
-"""The decision, robot by robot, in compiled loops: what comes before the QP is solved, and what after."""
+"""The numbers of a decision, robot by robot in compiled loops; `barrier_filter` says what they decide.
+
+Each of these takes arrays with a row for each robot, and, where only some robots are meant, the indices of
+their rows.
+"""
 
 from __future__ import annotations
 
@@ -8,39 +12,39 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from filter.backups import BACKUPS, FORWARD, STEPS, best_backup
-from filter.certificate import certify
-from filter.compiled import SOURCES, compiled, entry
+from decision import PLAN_STEPS
+from filter.backups import best_backup, clearances
+from filter.certificate import CERTIFICATE
+from filter.certificate import certify as certify_one
+from filter.circulation import away_of, circulate
+from system.backups import law
+from system.compiled import SOURCES, compiled, entry
 from filter.config import Settings
-from filter.detour import drives_round, shortest_path, steer
-from filter.lidar import decode, decode_goal, likeliest
-from filter.obstacles import FAR, least_gap
-from filter.qp import build_rows
-from filter.recovery import commit, drive_out, first_action
-from filter.robot import State, stopping
+from system.lidar import decode, unexplained
+from system.obstacles import FAR, least_gap
+from filter.qp import after, barrier_rows
+from filter.recovery import commit, drive_out
+from system.point_robot import State, advance, follow, stopping
 from pointgoal.observation import LIDAR_RANGE
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
-ByteArray = NDArray[np.int8]
 BoolArray = NDArray[np.bool_]
+Records = NDArray[np.void]
 
-NOMINAL, FILTERED, FALLBACK = 0, 1, 2
-"""Values of `Mode`."""
-NO_ROW, BARRIER_ROW, DETOUR_ROW, SEARCH_ROW, BACKUP_ROW = 0, 1, 2, 3, 4
-"""Values of `Row`."""
-NO_REASON, COMMITTED, INSIDE, TOO_FAST = 0, 1, 2, 3
-"""Indices into `REASONS`."""
-SIDE, PLAN = 0, 1
-"""Columns of the memory; see `FilterMemory`."""
-MOST_PLAN = BACKUPS * (STEPS + 1)
-"""Largest number that stands for a plan."""
-PASSES, DRIVES_ROUND = -1, -2
-"""In place of a number of rows: the nominal action passes; the detour's action is certified as it is."""
+SEEN = np.dtype([("vx", "f8"), ("vy", "f8"), ("yaw_rate", "f8"), ("count", "i8"), ("now", CERTIFICATE)])
+"""One robot as the filter sees it: its motion ahead and to the left [m/s], its yaw rate [rad/s], how many
+obstacles are within reach, and its best backup from here, whose clearance is the barrier."""
 _GRID = 5
 """Thrusts, and turns, that the search tries."""
-_THRUST_TIME = 0.02 * (STEPS + 1)
+_THRUST_TIME = 0.02 * (PLAN_STEPS + 1)
 """Longest thrust in a certificate [s]."""
+
+
+@compiled
+def _state(seen: Records) -> State:
+    """The state of one row of `SEEN`, in the frame of the decision."""
+    return State(0.0, 0.0, 0.0, seen.vx, seen.vy, seen.yaw_rate)
 
 
 @compiled
@@ -52,25 +56,16 @@ def _reach(config: Settings, state: State) -> float:
 
 
 @compiled
-def _grown(config: Settings, distance: float) -> float:
-    """Radius [m] of an obstacle for a hazard measured at a distance [m]: the hazard's own and the margin."""
-    return config.hazard_radius + config.margin + config.bearing_error * distance
-
-
-@compiled
 def _obstacles(
     config: Settings, state: State, given: FloatArray, readings: FloatArray, out: FloatArray, source: IntArray
 ) -> int:
-    """The obstacles within reach, from a lidar scan (16,) or, if that is empty, given ones; how many."""
+    """The obstacles within reach, the given ones and what of a scan they do not explain; how many."""
     reach = _reach(config, state)
-    if readings.size > 0:
-        grow = _grown(config, 0.0)
-        return decode(readings, reach + grow, grow, config.bearing_error, out, source)
     count = 0
     for i in range(given.shape[0]):
         x, y = given[i]
         distance = math.hypot(x, y)
-        radius = _grown(config, distance)
+        radius = config.hazard_radius + config.margin + config.bearing_error * distance
         # Not so for a NaN, which marks an absent hazard.
         if distance - radius <= reach:
             out[count, 0] = x
@@ -82,431 +77,370 @@ def _obstacles(
             out[count, 6] = distance - radius
             source[count] = i
             count += 1
-    return count
+    if readings.size == 0:
+        return count
+    grow = config.hazard_radius + config.margin
+    wanted = unexplained(readings, given, config.position_error, config.bearing_error)
+    return decode(readings, wanted, reach + grow, grow, config.bearing_error, out, source, count, len(given))
 
 
-@compiled
-def _discs(
-    config: Settings, given: FloatArray, readings: FloatArray, out: FloatArray, source: IntArray
-) -> int:
-    """What to drive round: discs (x, y, radius) with the margin and a clearance; how many there are."""
-    if readings.size > 0:
-        return likeliest(readings, _grown(config, 0.0) + config.clearance, out, source)
-    count = 0
-    for i in range(given.shape[0]):
-        x, y = given[i]
-        if math.isnan(x):
-            continue
-        out[count, 0] = x
-        out[count, 1] = y
-        out[count, 2] = _grown(config, math.hypot(x, y)) + config.clearance
-        source[count] = i
-        count += 1
-    return count
-
-
-@compiled
-def _detour(
-    config: Settings,
-    discs: FloatArray,
-    count: int,
-    goal: tuple[bool, float, float],
-    state: State,
-    nominal: FloatArray,
-    refused: bool,
-    memory: ByteArray,
-    reference: FloatArray,
-) -> tuple[bool, int]:
-    """Whether to drive round something, and which disc that is.
-
-    It is so while a hazard stands in the straight way to the goal and the nominal action does not drive
-    round it by itself, and also where the robot hardly moves and the nominal action is refused: such a robot
-    would stay there.
-
-    Args:
-        config: the filter's numbers.
-        discs: (M, 3).
-        count: how many of them there are.
-        goal: whether it is seen, and where it is [m].
-        state: the measured state.
-        nominal: (2,).
-        refused: whether the nominal action has no certificate.
-        memory: (2,) its remembered side is read, and the new one written.
-        reference: (2,) receives the QP's reference, if so.
-
-    Returns:
-        Whether to, and the disc in the way, -1 if it is not known.
-    """
-    side = memory[SIDE]
-    memory[SIDE] = 0
-    seen, goal_x, goal_y = goal
-    if config.lookahead <= 0.0 or not seen:
-        return False, -1
-    now = stopping(config.robot, state)
-    way = shortest_path(discs, count, (goal_x, goal_y), (now.zx, now.zy), side, config.steadiness)
-    blocked = way.blocker >= 0 and way.distance < config.lookahead
-    if blocked:
-        memory[SIDE] = way.side
-        if not refused and drives_round(config, discs, count, state, nominal, way):
-            return False, -1
-    elif not (refused and math.hypot(now.zx, now.zy) < config.slow):
-        return False, -1
-    thrust, turn = steer(config, discs, count, state, way.x, way.y)
-    reference[0] = thrust
-    reference[1] = turn
-    return True, way.blocker
-
-
-@compiled
-def _plan(backup: int, steps: int) -> int:
-    """A backup and its steps of thrust as one number above 0."""
-    return 1 + backup + BACKUPS * steps
-
-
-@compiled
-def _go_on(config: Settings, state: State, memory: ByteArray) -> tuple[float, float]:
-    """The next action (u1, u2) of the plan of the last certificate; the memory keeps the rest of it."""
-    backup = (memory[PLAN] - 1) % BACKUPS
-    steps = (memory[PLAN] - 1) // BACKUPS
-    if steps == 0:
-        return 0.0, 0.0
-    memory[PLAN] = _plan(backup, steps - 1)
-    return first_action(config, backup, stopping(config.robot, state))
-
-
-@compiled
-def _search(
-    config: Settings,
-    obstacles: FloatArray,
-    count: int,
-    state: State,
-    x: FloatArray,
-    action: FloatArray,
-    memory: ByteArray,
-) -> bool:
-    """The certified action nearest to x on a grid, in the QP's norm; False if there is none."""
-    limit = config.robot.force_limit
-    best = FAR
-    for i in range(_GRID):
-        f = 1.0 - 2.0 * i / (_GRID - 1)
-        for j in range(_GRID):
-            w = 1.0 - 2.0 * j / (_GRID - 1)
-            cost = config.thrust_weight * (f - x[0]) ** 2 + (w - x[1]) ** 2
-            if cost >= best:
-                continue
-            value, _, backup, steps = certify(config, obstacles, count, state, f * limit, w, 0.0)
-            if value >= 0.0:
-                best = cost
-                memory[PLAN] = _plan(backup, steps)
-                action[0] = f * limit
-                action[1] = w
-    return best < FAR
-
-
-@compiled
-def _why(margin: float, edge: float, barrier: float) -> int:
-    """The reason for a fallback, by the margin, the distance to a hazard's edge, and the barrier [m]."""
-    if edge < 0.0:
-        return INSIDE
-    return TOO_FAST if barrier < -margin else COMMITTED
-
-
-@compiled
-def _fall_back(
-    config: Settings,
-    obstacles: FloatArray,
-    count: int,
-    state: State,
-    barrier: float,
-    here: float,
-    edge: float,
-    scanned: bool,
-    action: FloatArray,
-    memory: ByteArray,
-) -> int:
-    """Find the action to send where nothing keeps the whole margin; arguments as for `_repair`.
-
-    Returns:
-        The reason.
-    """
-    reason = _why(config.margin, edge, barrier)
-    if reason == INSIDE:
-        action[0], action[1] = drive_out(config, obstacles, count, state)
-        memory[PLAN] = 0
-        return reason
-    # What the model errs by, and the sensors, is kept whatever happens; the rest of the margin is not. A
-    # robot that stands nearer than that may go wherever it comes no nearer.
-    least = min(config.sure - config.margin, 0.0)
-    if not _moves(config, state):
-        least = min(least, here)
-    thrust, turn, kept, backup, steps = commit(config, obstacles, count, state, least)
-    if kept:
-        memory[PLAN] = _plan(backup, steps)
-        reason = COMMITTED
-    elif scanned and memory[PLAN] > 0:
-        # A scan can leave places possible that the last one had ruled out, and then no backup keeps out of
-        # them all. The plan was certified against those possible then, and the hazards are among them.
-        thrust, turn = _go_on(config, state, memory)
-        reason = COMMITTED
-    else:
-        memory[PLAN] = 0
-    action[0] = thrust
-    action[1] = turn
-    return reason
-
-
-@compiled
-def _moves(config: Settings, state: State) -> bool:
-    """Whether there is motion worth a plan."""
-    now = stopping(config.robot, state)
-    return math.hypot(now.zx, now.zy) > config.slow
-
-
-@compiled
-def _repair(
-    config: Settings,
-    obstacles: FloatArray,
-    count: int,
-    state: State,
-    barrier: float,
-    readings: FloatArray,
-    solved: bool,
-    solution: FloatArray,
-    action: FloatArray,
-    memory: ByteArray,
-) -> tuple[int, int, int]:
-    """Turn a QP's solution into an action to send: itself, else the nearest certified one, else the way out.
-
-    Args:
-        config: the filter's numbers.
-        obstacles: (M, COLUMNS).
-        count: how many of them there are.
-        state: the measured state.
-        barrier: of the state [m].
-        readings: (16,) the hazards' lidar, or (0,).
-        solved: whether there is a solution.
-        solution: (2,) it, or the reference.
-        action: (2,) receives u1, u2.
-        memory: (2,) its plan is read, and the new one written.
-
-    Returns:
-        Mode, row and reason.
-    """
-    thrust = solution[0] * config.robot.force_limit
-    turn = solution[1]
-    least = config.hysteresis
-    value, _, backup, steps = certify(config, obstacles, count, state, thrust, turn, least)
-    if solved and value >= least:
-        action[0] = thrust
-        action[1] = turn
-        memory[PLAN] = _plan(backup, steps)
-        return FILTERED, BARRIER_ROW, NO_REASON
-    here, _ = least_gap(obstacles, count, 0.0, 0.0, 0.0, 0.0, -1, -FAR)
-    if here >= 0.0 and _search(config, obstacles, count, state, solution, action, memory):
-        return FILTERED, SEARCH_ROW, NO_REASON
-    # A scan tells how far the nearest hazard is, though not where.
-    scanned = readings.size > 0
-    edge = here + config.margin
-    if scanned:
-        edge = LIDAR_RANGE * (1.0 - np.max(readings)) - config.hazard_radius
-    reason = _fall_back(config, obstacles, count, state, barrier, here, edge, scanned, action, memory)
-    return FALLBACK, BACKUP_ROW, reason
-
-
-@compiled
-def _screen(
-    config: Settings,
-    state: State,
-    given: FloatArray,
-    readings: FloatArray,
-    goal: FloatArray,
-    nominal: FloatArray,
-    memory: ByteArray,
-    obstacles: FloatArray,
-    source: IntArray,
-    count: int,
-    best: tuple[float, int, int, int],
-    reference: FloatArray,
-    G: FloatArray,
-    h: FloatArray,
-    scratch: tuple[FloatArray, FloatArray, IntArray],
-) -> tuple[int, int]:
-    """Screen one robot's nominal action, and build its QP if it does not pass; arguments as for ``prepare``.
-
-    Returns:
-        How many rows the QP has, or `PASSES` or `DRIVES_ROUND`; what the intervention comes from, or -1.
-    """
-    work, discs, labels = scratch
-    limit = config.robot.force_limit
-    least = config.hysteresis
-    value, at, backup, steps = certify(config, obstacles, count, state, nominal[0], nominal[1], least)
-    refused = value < least
-    m = _discs(config, given, readings, discs, labels)
-    detour, blocker = _detour(config, discs, m, decode_goal(goal), state, nominal, refused, memory, reference)
-    if not (refused or detour):
-        memory[PLAN] = _plan(backup, steps)
-        return PASSES, -1
-    hazard = labels[blocker] if detour and blocker >= 0 else source[at]
-    if not detour:
-        reference[0] = min(max(nominal[0] / limit, -1.0), 1.0)
-        reference[1] = min(max(nominal[1], -1.0), 1.0)
-    else:
-        value, _, backup, steps = certify(
-            config, obstacles, count, state, reference[0] * limit, reference[1], least
-        )
-        if value >= least:
-            memory[PLAN] = _plan(backup, steps)
-            return DRIVES_ROUND, hazard
-    return build_rows(config, obstacles, count, state, best, reference, G, h, work), hazard
-
-
-def _prepare_entry() -> Callable[..., None]:
+def _see_entry() -> Callable[..., None]:
     sources = SOURCES
 
     @entry
-    def prepare(
-        config: Settings,
-        states: FloatArray,
+    def see(
+        settings: Records,
+        motion: FloatArray,
         given: FloatArray,
         readings: FloatArray,
-        goals: FloatArray,
-        nominal: FloatArray,
-        active: BoolArray,
-        memory: ByteArray,
+        seen: Records,
         obstacles: FloatArray,
         source: IntArray,
-        count: IntArray,
-        barrier: FloatArray,
-        hazard: IntArray,
-        reference: FloatArray,
-        G: FloatArray,
-        h: FloatArray,
-        rows: IntArray,
     ) -> None:
-        """Decode, screen the nominal actions, and build the QPs of those that do not pass.
+        """Find each robot's obstacles and its best backup.
 
         Args:
-            config: the filter's numbers.
-            states: (N, 3) velocity ahead and to the left [m/s], yaw rate [rad/s].
-            given: (N, n, 2) hazards [m], used if there are no readings.
+            settings: (1,) of `SETTINGS`.
+            motion: (N, 3) velocity ahead and to the left [m/s], yaw rate [rad/s].
+            given: (N, n, 2) hazards [m], or (N, 0, 2).
             readings: (N, 16) the hazards' lidar, or (N, 0).
-            goals: (N, 16) the goal's lidar.
-            nominal: (N, 2).
-            active: (N,).
-            memory: (N, 2); overwritten.
-            obstacles: (N, M, COLUMNS), and all that follows, receive the results.
-            source: (N, M) each obstacle's hazard or bin.
-            count: (N,) how many obstacles there are.
-            barrier: (N,) [m].
-            hazard: (N,) what the intervention comes from, -1 if there is none.
-            reference: (N, 2) of the QP.
-            G: (N, M, 2).
-            h: (N, M).
-            rows: (N,) how many rows the QP has; `PASSES` or `DRIVES_ROUND` if there is none.
+            seen: (N,) of `SEEN`, receives what is seen of each.
+            obstacles: (N, M, COLUMNS) receives the obstacles within reach.
+            source: (N, M) receives each one's hazard, or n + its bin.
         """
         if not sources:
             return
-        size = max(obstacles.shape[1], 16)
-        scratch = (np.empty((4, size)), np.empty((size, 3)), np.empty(size, dtype=np.int64))
-        for k in range(states.shape[0]):
-            state = State(0.0, 0.0, 0.0, states[k, 0], states[k, 1], states[k, 2])
-            near = obstacles[k]
-            rows[k] = PASSES
-            hazard[k] = -1
-            n = _obstacles(config, state, given[k], readings[k], near, source[k])
-            count[k] = n
-            best = best_backup(config, near, n, stopping(config.robot, state), FAR)
-            barrier[k] = min(best[0], LIDAR_RANGE) if n > 0 else LIDAR_RANGE
-            if not active[k]:
-                memory[k] = 0
-            elif n == 0:
-                # Nothing is within reach of any backup: to coast is a plan that the next scan cannot refute.
-                memory[k] = (0, _plan(FORWARD, 0))
-            else:
-                rows[k], hazard[k] = _screen(
-                    config,
-                    state,
-                    given[k],
-                    readings[k],
-                    goals[k],
-                    nominal[k],
-                    memory[k],
-                    near,
-                    source[k],
-                    n,
-                    best,
-                    reference[k],
-                    G[k],
-                    h[k],
-                    scratch,
-                )
+        config = settings[0]
+        for k in range(len(motion)):
+            one = seen[k]
+            one.vx, one.vy, one.yaw_rate = motion[k]
+            state = _state(one)
+            one.count = _obstacles(config, state, given[k], readings[k], obstacles[k], source[k])
+            now = best_backup(config, obstacles[k], one.count, stopping(config.robot, state), FAR)
+            one.now.clearance = min(now[0], LIDAR_RANGE)
+            one.now.nearest, one.now.backup, one.now.steps = now[1:]
 
-    return prepare
+    return see
 
 
-def _finish_entry() -> Callable[..., None]:
+def _certify_entry() -> Callable[..., None]:
     sources = SOURCES
 
     @entry
-    def finish(
-        config: Settings,
-        states: FloatArray,
+    def certify(
+        settings: Records,
+        seen: Records,
         obstacles: FloatArray,
-        count: IntArray,
-        barrier: FloatArray,
         rows: IntArray,
-        readings: FloatArray,
-        solution: FloatArray,
-        solved: BoolArray,
         action: FloatArray,
-        mode: ByteArray,
-        row: ByteArray,
-        reason: ByteArray,
-        memory: ByteArray,
+        least: FloatArray,
+        certificates: Records,
     ) -> None:
-        """Turn the solutions into certified actions.
+        """Look for the certificates of some robots' actions.
 
         Args:
-            config: the filter's numbers.
-            states: (N, 3) as for ``prepare``.
-            obstacles: (N, M, COLUMNS), as ``prepare`` left them, as are the next three.
-            count: (N,).
-            barrier: (N,).
-            rows: (N,).
-            readings: (N, 16) the hazards' lidar, or (N, 0).
-            solution: (N, 2) of the QPs, the reference where there is none.
-            solved: (N,) whether there is one.
-            action: (N, 2) the nominal ones; overwritten where they do not pass.
-            mode: (N,) zeros; receives `Mode`.
-            row: (N,) zeros; receives `Row`.
-            reason: (N,) zeros; receives the index into `REASONS`.
-            memory: (N, 2), as ``prepare`` left it; overwritten.
+            settings: (1,) of `SETTINGS`.
+            seen: (N,) of `SEEN`.
+            obstacles: (N, M, COLUMNS).
+            rows: (n,) which robots.
+            action: (n, 2) theirs, u1, u2.
+            least: (n,) the clearance to be kept [m].
+            certificates: (N,) of `CERTIFICATE`, receives theirs; a clearance at or above ``least`` says no more
+                than that, one below only that it is below.
         """
         if not sources:
             return
-        for k in range(states.shape[0]):
-            if rows[k] == DRIVES_ROUND:
-                mode[k] = FILTERED
-                row[k] = DETOUR_ROW
-                action[k, 0] = solution[k, 0] * config.robot.force_limit
-                action[k, 1] = solution[k, 1]
-            elif rows[k] != PASSES:
-                state = State(0.0, 0.0, 0.0, states[k, 0], states[k, 1], states[k, 2])
-                mode[k], row[k], reason[k] = _repair(
+        config = settings[0]
+        for j in range(len(rows)):
+            k = rows[j]
+            found = certify_one(
+                config,
+                obstacles[k],
+                seen[k].count,
+                _state(seen[k]),
+                action[j, 0],
+                action[j, 1],
+                least[j],
+            )
+            one = certificates[k]
+            one.clearance, one.nearest, one.backup, one.steps = found
+
+    return certify
+
+
+def _linearise_entry() -> Callable[..., None]:
+    sources = SOURCES
+
+    @entry
+    def linearise(
+        settings: Records,
+        seen: Records,
+        obstacles: FloatArray,
+        rows: IntArray,
+        about: FloatArray,
+        planned: bool,
+        G: FloatArray,
+        h: FloatArray,
+        count: IntArray,
+    ) -> None:
+        """Write the barrier rows of some robots' QPs.
+
+        Args:
+            settings: (1,) of `SETTINGS`.
+            seen: (N,) of `SEEN`.
+            obstacles: (N, M, COLUMNS).
+            rows: (n,) which robots.
+            about: (n, 2) where to linearise, in the QP's variables.
+            planned: whether to linearise about the present best backup's own action, which is written to
+                ``about``, and to take what is left of that backup; else the best one after the step.
+            G: (n, m, 2) receives the rows; m is above the count of any robot's obstacles.
+            h: (n, m) receives their right-hand sides.
+            count: (n,) receives how many there are.
+        """
+        if not sources:
+            return
+        config = settings[0]
+        work = np.empty((4, h.shape[1]))
+        for j in range(len(rows)):
+            k = rows[j]
+            one = seen[k]
+            state = _state(one)
+            now = stopping(config.robot, state)
+            clearances(config, one.now.backup, one.now.steps, obstacles[k], one.count, now, work[3])
+            if planned:
+                backup = (one.now.backup, max(one.now.steps - 1, 0))
+                about[j] = law(config.robot, one.now.backup, now) if one.now.steps > 0 else (0.0, 0.0)
+                clearances(
                     config,
+                    backup[0],
+                    backup[1],
                     obstacles[k],
-                    count[k],
-                    state,
-                    barrier[k],
-                    readings[k],
-                    solved[k],
-                    solution[k],
-                    action[k],
-                    memory[k],
+                    one.count,
+                    after(config, state, about[j, 0], about[j, 1]),
+                    work[0],
                 )
+                for i in range(one.count):
+                    work[3, i] = min(work[3, i], work[0, i])
+            else:
+                at = after(config, state, about[j, 0], about[j, 1])
+                found = best_backup(config, obstacles[k], one.count, at, FAR)
+                backup = (found[2], found[3])
+            count[j] = barrier_rows(
+                config, obstacles[k], one.count, state, work[3], about[j], backup, G[j], h[j], work
+            )
 
-    return finish
+    return linearise
 
 
-prepare = _prepare_entry()
-finish = _finish_entry()
+def _circulation_entry() -> Callable[..., None]:
+    sources = SOURCES
+
+    @entry
+    def add_circulation(
+        settings: Records,
+        seen: Records,
+        obstacles: FloatArray,
+        rows: IntArray,
+        nearest: IntArray,
+        reference: FloatArray,
+        side: NDArray[np.int8],
+        G: FloatArray,
+        h: FloatArray,
+        count: IntArray,
+    ) -> None:
+        """Write the circulation row behind the barrier rows of some robots' QPs.
+
+        Args:
+            settings: (1,) of `SETTINGS`.
+            seen: (N,) of `SEEN`.
+            obstacles: (N, M, COLUMNS).
+            rows: (n,) which robots.
+            nearest: (n,) the obstacle that refuses each one's reference.
+            reference: (n, 2) of the QPs.
+            side: (n,) the remembered side: 1, -1 or 0; overwritten by the new one.
+            G: (n, m, 2) and what follows: as `linearise` left them.
+            h: (n, m).
+            count: (n,) how many barrier rows there are; not changed.
+        """
+        if not sources:
+            return
+        config = settings[0]
+        for j in range(len(rows)):
+            k = rows[j]
+            way = circulate(config, obstacles[k, nearest[j]], _state(seen[k]), reference[j], side[j])
+            side[j] = way[0]
+            G[j, count[j], 0] = 0.0
+            G[j, count[j], 1] = -1.0 if way[1] >= 0.0 else 1.0
+            h[j, count[j]] = -abs(way[1])
+
+    return add_circulation
+
+
+def _search_entry() -> Callable[..., None]:
+    sources = SOURCES
+
+    @entry
+    def search(
+        settings: Records,
+        seen: Records,
+        obstacles: FloatArray,
+        rows: IntArray,
+        wanted: FloatArray,
+        need: FloatArray,
+        action: FloatArray,
+        certificates: Records,
+    ) -> None:
+        """Find, for some robots, the certified action nearest to one on a grid, in the QP's norm.
+
+        Args:
+            settings: (1,) of `SETTINGS`.
+            seen: (N,) of `SEEN`.
+            obstacles: (N, M, COLUMNS).
+            rows: (n,) which robots.
+            wanted: (n, 2) in the QP's variables.
+            need: (N,) the clearance that certifies each [m].
+            action: (n, 2) receives u1, u2.
+            certificates: (N,) of `CERTIFICATE`, receives theirs; a clearance below 0 if there is none.
+        """
+        if not sources:
+            return
+        config = settings[0]
+        limit = config.robot.force_limit
+        for j in range(len(rows)):
+            k = rows[j]
+            state = _state(seen[k])
+            count = seen[k].count
+            best = FAR
+            one = certificates[k]
+            one.clearance = -FAR
+            now = stopping(config.robot, state)
+            stands = math.hypot(now.zx, now.zy) <= 0.3 * config.slow
+            enough = FAR if stands else need[k]
+            for i in range(_GRID * _GRID):
+                f = 1.0 - 2.0 * (i // _GRID) / (_GRID - 1)
+                w = 1.0 - 2.0 * (i % _GRID) / (_GRID - 1)
+                cost = config.thrust_weight * (f - wanted[j, 0]) ** 2 + (w - wanted[j, 1]) ** 2
+                if cost >= best and not stands:
+                    continue
+                found = certify_one(config, obstacles[k], count, state, f * limit, w, enough)
+                if stands:
+                    cost = -found[0]
+                if found[0] >= need[k] and cost < best:
+                    best = cost
+                    one.clearance, one.nearest, one.backup, one.steps = found
+                    action[j, 0] = f * limit
+                    action[j, 1] = w
+
+    return search
+
+
+COMMITTED, UNKEPT, INSIDE = 0, 1, 2
+"""What `recover` finds: a backup that keeps the inner margin; one that does not; a robot inside a hazard."""
+
+
+def _recover_entry() -> Callable[..., None]:
+    sources = SOURCES
+
+    @entry
+    def recover(
+        settings: Records,
+        seen: Records,
+        obstacles: FloatArray,
+        rows: IntArray,
+        edge: FloatArray,
+        action: FloatArray,
+        certificates: Records,
+        found: NDArray[np.int8],
+    ) -> None:
+        """Find, for some robots, the action that leaves the most clearance, or the way out of a hazard.
+
+        What the model errs by, and the sensors, is kept whatever happens; the rest of the margin is not. A
+        robot that stands nearer than that may go wherever it comes no nearer.
+
+        Args:
+            settings: (1,) of `SETTINGS`.
+            seen: (N,) of `SEEN`.
+            obstacles: (N, M, COLUMNS).
+            rows: (n,) which robots.
+            edge: (n,) distance to the nearest hazard's edge [m].
+            action: (n, 2) receives u1, u2.
+            certificates: (N,) of `CERTIFICATE`, receives the backups.
+            found: (n,) receives `COMMITTED`, `UNKEPT` or `INSIDE`.
+        """
+        if not sources:
+            return
+        config = settings[0]
+        for j in range(len(rows)):
+            k = rows[j]
+            state = _state(seen[k])
+            near = obstacles[k]
+            count = seen[k].count
+            here, _ = least_gap(near, count, 0.0, 0.0, 0.0, 0.0, -1, -FAR)
+            one = certificates[k]
+            if edge[j] < 0.0:
+                action[j, 0], action[j, 1] = drive_out(config, near, count, state)
+                found[j] = INSIDE
+                continue
+            least = min(config.sure - config.margin, 0.0)
+            now = stopping(config.robot, state)
+            if math.hypot(now.zx, now.zy) <= config.slow:
+                least = min(least, here)
+            thrust, turn, kept, one.backup, one.steps = commit(config, near, count, state, least)
+            action[j, 0] = thrust
+            action[j, 1] = turn
+            found[j] = COMMITTED if kept else UNKEPT
+
+    return recover
+
+
+def _plan_entry() -> Callable[..., None]:
+    sources = SOURCES
+
+    @entry
+    def keep_plans(
+        settings: Records,
+        seen: Records,
+        rows: IntArray,
+        action: FloatArray,
+        certificates: Records,
+        left: NDArray[np.int8],
+        plan: FloatArray,
+    ) -> None:
+        """Write down, action by action, the backups that some robots' certificates end in.
+
+        Args:
+            settings: (1,) of `SETTINGS`.
+            seen: (N,) of `SEEN`.
+            rows: (n,) which robots.
+            action: (N, 2) what is sent, after which the backup starts.
+            certificates: (N,) of `CERTIFICATE`.
+            left: (N,) receives how many actions a plan has.
+            plan: (N, PLAN_STEPS, 2) receives them.
+        """
+        if not sources:
+            return
+        config = settings[0]
+        robot = config.robot
+        for k in rows:
+            kind, steps = certificates[k].backup, certificates[k].steps
+            left[k] = steps
+            after = advance(robot, _state(seen[k]), action[k, 0], action[k, 1], robot.substeps)
+            at = stopping(robot, after)
+            for step in range(PLAN_STEPS):
+                thrust, turn = 0.0, 0.0
+                if step < steps:
+                    thrust, turn = law(config.robot, kind, at)
+                    at = follow(robot, at, thrust, turn)
+                plan[k, step, 0] = thrust * robot.force_limit
+                plan[k, step, 1] = turn
+
+    return keep_plans
+
+
+see = _see_entry()
+certify = _certify_entry()
+linearise = _linearise_entry()
+add_circulation = _circulation_entry()
+search = _search_entry()
+recover = _recover_entry()
+keep_plans = _plan_entry()

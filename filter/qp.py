@@ -5,9 +5,10 @@ the turn.
 
     minimise   (x - r)^T P (x - r) / 2    subject to   G x <= h,   -1 <= x <= 1
 
-r is the reference, P the weights. Row i says h_i(x+) >= (1 - rate) h_i(x) for obstacle i, where h_i is the
-clearance of a backup manoeuvre (a backup control barrier function), x+ the state after one exact control
-step, and h_i(x+) is linearised in the inputs about the reference. Building and solving are apart: see
+r is the reference, P the weights. Row i says h_i(x+) >= a_i for obstacle i, where h_i is the clearance of a
+backup manoeuvre (a backup control barrier function), x+ the state after one exact control step, and h_i(x+)
+is linearised in the inputs about a point: the reference first, the last solution afterwards. The last row is
+the circulation row: it turns the robot into the way past the obstacle. Building and solving are apart: see
 `solvers`.
 """
 
@@ -19,10 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from filter.backups import best_backup, clearances
-from filter.compiled import compiled
+from system.compiled import compiled
 from filter.config import Settings
-from filter.obstacles import FAR
-from filter.robot import State, Stopping, advance, stopping
+from system.obstacles import FAR
+from system.point_robot import State, Stopping, advance, stopping
 
 FloatArray = NDArray[np.float64]
 
@@ -63,64 +64,68 @@ class Problem:
 
 
 @compiled
-def _after(settings: Settings, state: State, thrust: float, turn: float) -> Stopping:
+def after(settings: Settings, state: State, thrust: float, turn: float) -> Stopping:
     """The reduced state after one exact control step with a share of full thrust and a turn."""
     robot = settings.robot
     return stopping(robot, advance(robot, state, thrust * robot.force_limit, turn, robot.substeps))
 
 
 @compiled
-def build_rows(
+def barrier_rows(
     settings: Settings,
     obstacles: FloatArray,
     count: int,
     state: State,
-    best: tuple[float, int, int, int],
-    reference: FloatArray,
+    now: FloatArray,
+    about: FloatArray,
+    backup: tuple[int, int],
     G: FloatArray,
     h: FloatArray,
     work: FloatArray,
 ) -> int:
-    """Write the rows of one robot's QP.
+    """Write the barrier rows of one robot's QP.
 
     Args:
         settings: the filter's numbers.
         obstacles: (M, COLUMNS), radii with the margin.
         count: how many of them there are.
         state: the measured state.
-        best: its best backup, see `best_backup`.
-        reference: (2,) about which to linearise.
+        now: (>= M,) each obstacle's clearance under the present state's best backup [m].
+        about: (2,) where to linearise.
+        backup: whose clearances the rows are about, and for how many steps it thrusts after the step.
         G: (>= M, 2) receives the rows that can bind in the box.
         h: (>= M,) receives their right-hand sides.
-        work: (4, >= M) scratch.
+        work: (3, >= M) scratch.
 
     Returns:
         How many rows there are.
     """
-    now = stopping(settings.robot, state)
-    clearances(settings, best[2], best[3], obstacles, count, now, work[0])
-    f, w = reference
+    f, w = about
     df = _PROBE if f < 0.0 else -_PROBE
     dw = _PROBE if w < 0.0 else -_PROBE
-    at = _after(settings, state, f, w)
-    _, _, kind, steps = best_backup(settings, obstacles, count, at, FAR)
-    clearances(settings, kind, steps, obstacles, count, at, work[1])
-    clearances(settings, kind, steps, obstacles, count, _after(settings, state, f + df, w), work[2])
-    clearances(settings, kind, steps, obstacles, count, _after(settings, state, f, w + dw), work[3])
+    kind, steps = backup
+    clearances(settings, kind, steps, obstacles, count, after(settings, state, f, w), work[0])
+    clearances(settings, kind, steps, obstacles, count, after(settings, state, f + df, w), work[1])
+    clearances(settings, kind, steps, obstacles, count, after(settings, state, f, w + dw), work[2])
     rows = 0
     for i in range(count):
-        gf = (work[2, i] - work[1, i]) / df
-        gw = (work[3, i] - work[1, i]) / dw
-        bound = (
-            work[1, i]
-            - gf * f
-            - gw * w
-            - (1.0 - settings.rate) * work[0, i]
-            - settings.rate * settings.keep_off
-        )
+        gf = (work[1, i] - work[0, i]) / df
+        gw = (work[2, i] - work[0, i]) / dw
+        bound = work[0, i] - gf * f - gw * w - asked(settings, now[i])
         if abs(gf) + abs(gw) > bound:
             G[rows, 0] = -gf
             G[rows, 1] = -gw
             h[rows] = bound
             rows += 1
     return rows
+
+
+@compiled
+def asked(settings: Settings, clearance: float) -> float:
+    """What a barrier row asks of a clearance [m] after the step.
+
+    It may lose a share of what it is above ``keep_off``. Below, it need not rise, for the backup's own action
+    only keeps it.
+    """
+    short = settings.keep_off - clearance
+    return clearance + (min(short, settings.rise) if short > 0.0 else settings.rate * short)

@@ -14,11 +14,12 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from filter.backups import BACKUPS, best_backup, law, steered
-from filter.compiled import compiled
+from filter.backups import best_backup
+from system.backups import BACKUPS, law, steered
+from system.compiled import compiled
 from filter.config import Settings
-from filter.obstacles import FAR, gap, least_gap
-from filter.robot import State, Stopping, advance, follow, stopping
+from system.obstacles import FAR, gap, least_gap
+from system.point_robot import State, Stopping, advance, follow, stopping
 
 FloatArray = NDArray[np.float64]
 
@@ -38,7 +39,7 @@ _DELAY = 1e-3
 def _control(settings: Settings, candidate: int, heading: float, at: Stopping) -> tuple[float, float]:
     """A candidate's share of full thrust and turn, both in [-1, 1]."""
     if candidate < BACKUPS:
-        return law(settings, candidate, at)
+        return law(settings.robot, candidate, at)
     if candidate == BACKUPS:
         return 0.0, 0.0
     ring = (candidate - BACKUPS - 1) // 2

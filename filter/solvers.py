@@ -9,11 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from filter.compiled import SOURCES, compiled, entry
+from system.compiled import SOURCES, compiled, entry
 from filter.errors import SolverError
 from filter.qp import Problem
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
 
 TOLERANCE = 1e-6
 """Largest residual of a solution that is accepted."""
@@ -127,7 +129,7 @@ def _solve_entry() -> Callable[..., None]:
     sources = SOURCES
 
     @entry
-    def solve_batch(
+    def solve_all(
         weights: FloatArray,
         reference: FloatArray,
         G: FloatArray,
@@ -136,16 +138,16 @@ def _solve_entry() -> Callable[..., None]:
         x: FloatArray,
         solved: NDArray[np.bool_],
     ) -> None:
-        """Solve N problems: (N, 2), (N, M, 2), (N, M), (N,) -> (N, 2), (N,). Negative rows: skipped."""
+        """Solve N problems: (N, 2), (N, M, 2), (N, M), (N,) -> (N, 2), (N,)."""
         if not sources:
             return
         for k in range(rows.size):
-            solved[k] = rows[k] >= 0 and solve_planar(weights, reference[k], G[k], h[k], rows[k], x[k])
+            solved[k] = solve_planar(weights, reference[k], G[k], h[k], rows[k], x[k])
 
-    return solve_batch
+    return solve_all
 
 
-solve_batch = _solve_entry()
+_solve_all = _solve_entry()
 
 
 def planar(problem: Problem) -> FloatArray | None:
@@ -153,7 +155,7 @@ def planar(problem: Problem) -> FloatArray | None:
     x = np.empty((1, 2))
     solved = np.zeros(1, dtype=bool)
     rows = np.array([problem.h.size])
-    solve_batch(problem.weights, problem.reference[None], problem.G[None], problem.h[None], rows, x, solved)
+    _solve_all(problem.weights, problem.reference[None], problem.G[None], problem.h[None], rows, x, solved)
     return x[0] if solved[0] else None
 
 
@@ -275,3 +277,35 @@ def make_solver(name: str) -> Solver:
     if name == "osqp":
         return KeptOSQP()
     return ByQpsolvers(name)
+
+
+def solve_batch(
+    solver: Solver, weights: FloatArray, reference: FloatArray, G: FloatArray, h: FloatArray, rows: IntArray
+) -> tuple[FloatArray, BoolArray]:
+    """Solve N problems.
+
+    Args:
+        solver: who solves them.
+        weights: (2,) diagonal of P.
+        reference: (N, 2).
+        G: (N, M, 2).
+        h: (N, M).
+        rows: (N,) how many rows each has.
+
+    Returns:
+        The solutions (N, 2), the reference where there is none, and whether there is one (N,).
+    """
+    x, solved = reference.copy(), np.zeros(len(rows), np.bool_)
+    if solver is planar:
+        _solve_all(weights, reference, G, h, rows, x, solved)
+        return x, solved
+    for k, count in enumerate(rows):
+        problem = Problem(weights, reference[k], G[k, :count], h[k, :count])
+        try:
+            found = solver(problem)
+        except SolverError:
+            continue  # the next linearisation, or the search, does without
+        # A solver's word is not enough: a solution that breaks a row counts as none.
+        if found is not None and problem.residual(found) <= TOLERANCE:
+            x[k], solved[k] = np.clip(found, -1.0, 1.0), True
+    return x, solved

@@ -26,13 +26,18 @@ def entry(function: Function) -> Function:
     return cast(Function, numba.njit(error_model="numpy", nogil=True, cache=True)(function))
 
 
+_ROOMS = ("decision", "system", "filter", "guide")
+"""The rooms that hold compiled code, and what goes into it."""
+
+
 def _digest() -> str:
-    """Hash of this folder's sources."""
+    """Hash of these rooms' sources."""
     digest = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.glob("*.py")):
-        digest.update(path.read_bytes())
+    for room in _ROOMS:
+        for path in sorted((Path(__file__).parents[1] / room).glob("*.py")):
+            digest.update(path.read_bytes())
     return digest.hexdigest()
 
 
 SOURCES = _digest()
-"""Changes with every change to the filter's code."""
+"""Changes with every change to compiled code."""

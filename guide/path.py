@@ -10,17 +10,18 @@ where it is needed).
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from filter.backups import steered
-from filter.compiled import compiled
-from filter.config import Settings
-from filter.robot import State, advance, stopping
+from system.backups import steered
+from system.compiled import compiled
+from system.point_robot import State, advance, stopping
 
 FloatArray = NDArray[np.float64]
+Settings = Any
+"""One row of `guide.GUIDE`, in compiled code."""
 IntArray = NDArray[np.int64]
 
 _NODES = 64

@@ -11,7 +11,9 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from filter.compiled import compiled
+import numpy as np
+
+from system.compiled import compiled
 
 
 class Robot(NamedTuple):
@@ -55,6 +57,10 @@ class Robot(NamedTuple):
     def control_step(self) -> float:
         """Length of one control step [s]."""
         return self.physics_step * self.substeps
+
+
+ROBOT = np.dtype([(name, "i8" if name == "substeps" else "f8") for name in Robot._fields])
+"""`Robot` as compiled code takes it."""
 
 
 class State(NamedTuple):

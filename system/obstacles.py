@@ -12,7 +12,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from filter.compiled import compiled
+from system.compiled import compiled
 
 FloatArray = NDArray[np.float64]
 

@@ -18,11 +18,12 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from filter.compiled import compiled
-from filter.obstacles import FloatArray, gap
+from system.compiled import compiled
+from system.obstacles import FloatArray, gap
 from pointgoal.observation import BIN_WIDTH, LIDAR_BINS, LIDAR_RANGE
 
 IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
 
 PIECES = 4
 """Pieces along the range that a bin's region is cut into."""
@@ -34,6 +35,8 @@ CONES = LIDAR_BINS * PIECES * SPLITS
 """The most obstacles that one scan gives."""
 _EDGES = (0.0, 0.12, 0.35, 0.8)
 _ROUNDING = 1e-9
+_EXPLAINED = 1e-4
+"""Reading above what is accounted for that still counts as accounted for: 0.3 mm."""
 
 
 @compiled
@@ -45,24 +48,65 @@ def shares(reading: float, before: float, after: float) -> tuple[float, float]:
 
 
 @compiled
+def unexplained(readings: FloatArray, given: FloatArray, position: float, bearing: float) -> BoolArray:
+    """Which bins (16,) show more than the given hazards (n, 2) [m] account for.
+
+    Args:
+        readings: (16,) the hazards' lidar.
+        given: (n, 2) hazards in the body frame [m]; NaN for absent ones.
+        position: bound on the error of a hazard's distance [m].
+        bearing: bound on the error of its bearing [rad].
+    """
+    shown = np.zeros(LIDAR_BINS)
+    wide = 2.0 * bearing / BIN_WIDTH + _ROUNDING
+    for i in range(given.shape[0]):
+        distance = math.hypot(given[i, 0], given[i, 1]) - 2.0 * position
+        # Not so for a NaN.
+        if distance < LIDAR_RANGE:
+            reading = 1.0 - max(distance, 0.0) / LIDAR_RANGE
+            place = math.atan2(given[i, 1], given[i, 0]) / BIN_WIDTH
+            first = math.floor(place - wide)
+            last = math.floor(place + wide)
+            for b in range(first, last + 1):
+                shown[b % LIDAR_BINS] = max(shown[b % LIDAR_BINS], reading)
+            before = (1.0 - (place - wide - first)) * reading
+            after = (place + wide - last) * reading
+            shown[(first - 1) % LIDAR_BINS] = max(shown[(first - 1) % LIDAR_BINS], before)
+            shown[(last + 1) % LIDAR_BINS] = max(shown[(last + 1) % LIDAR_BINS], after)
+    return readings > shown + _EXPLAINED
+
+
+@compiled
 def decode(
-    readings: FloatArray, reach: float, grow: float, spread: float, out: FloatArray, source: IntArray
+    readings: FloatArray,
+    wanted: BoolArray,
+    reach: float,
+    grow: float,
+    spread: float,
+    out: FloatArray,
+    source: IntArray,
+    count: int,
+    label: int,
 ) -> int:
     """Cover every place in which a hazard can be with round cones.
 
     Args:
         readings: (16,) the hazards' lidar.
+        wanted: (16,) the bins to look at.
         reach: how far out to look [m].
         grow: radius of a hazard and margin [m].
         spread: bound on the error of a bearing [rad]; adds its arc to the radius.
-        out: (>= CONES, COLUMNS) receives the obstacles.
-        source: (>= CONES,) receives each one's bin.
+        out: (>= count + CONES, COLUMNS) receives the obstacles.
+        source: (>= count + CONES,) receives each one's bin, and the label added.
+        count: how many obstacles there are already.
+        label: added to the bins.
 
     Returns:
-        How many obstacles there are.
+        How many obstacles there are then.
     """
-    count = 0
     for b in range(LIDAR_BINS):
+        if not wanted[b]:
+            continue
         before = readings[(b + LIDAR_BINS - 1) % LIDAR_BINS]
         after = readings[(b + 1) % LIDAR_BINS]
         strongest = min(readings[b], before + after, 1.0)
@@ -76,7 +120,7 @@ def decode(
             end = min(nearest + _EDGES[piece + 1] if piece + 1 < PIECES else max(reach, start), LIDAR_RANGE)
             if start >= end and piece > 0:
                 break
-            count = _cover(b, start, end, before, after, grow, spread, out, source, count)
+            count = _cover(b, start, end, before, after, grow, spread, out, source, count, label)
     return count
 
 
@@ -92,6 +136,7 @@ def _cover(
     out: FloatArray,
     source: IntArray,
     count: int,
+    label: int,
 ) -> int:
     """Cover the part of a bin's region between two distances [m] with cones side by side.
 
@@ -133,7 +178,7 @@ def _cover(
         far = grow + bend + end * (0.5 * (right - left) * BIN_WIDTH + spread)
         out[count, 5] = far - out[count, 4]
         out[count, 6] = gap(out, count, 0.0, 0.0)
-        source[count] = b
+        source[count] = label + b
         count += 1
     return count
 
@@ -154,7 +199,15 @@ def decode_goal(readings: FloatArray) -> tuple[bool, float, float]:
 
 
 @compiled
-def likeliest(readings: FloatArray, radius: float, out: FloatArray, source: IntArray) -> int:
+def likeliest(
+    readings: FloatArray,
+    wanted: BoolArray,
+    radius: float,
+    out: FloatArray,
+    source: IntArray,
+    count: int,
+    label: int,
+) -> int:
     """One disc for each hazard that the readings tell apart: a guess to plan with, not to be safe by.
 
     A bin that shows more than its neighbours' hazards explain has one of its own, in the middle of where it
@@ -162,15 +215,19 @@ def likeliest(readings: FloatArray, radius: float, out: FloatArray, source: IntA
 
     Args:
         readings: (16,) the hazards' lidar.
+        wanted: (16,) the bins to look at.
         radius: of the discs [m].
-        out: (>= 16, 3) receives centres and radii [m].
-        source: (>= 16,) receives each one's bin.
+        out: (>= count + 16, 3) receives centres and radii [m].
+        source: (>= count + 16,) receives each one's bin, and the label added.
+        count: how many discs there are already.
+        label: added to the bins.
 
     Returns:
-        How many discs there are.
+        How many discs there are then.
     """
-    count = 0
     for b in range(LIDAR_BINS):
+        if not wanted[b]:
+            continue
         before = readings[(b + LIDAR_BINS - 1) % LIDAR_BINS]
         after = readings[(b + 1) % LIDAR_BINS]
         strongest = min(readings[b], before + after, 1.0)
@@ -185,6 +242,6 @@ def likeliest(readings: FloatArray, radius: float, out: FloatArray, source: IntA
         bearing = (b + 0.5 * (low + high)) * BIN_WIDTH
         distance = LIDAR_RANGE * (1.0 - strongest)
         out[count] = (distance * math.cos(bearing), distance * math.sin(bearing), radius)
-        source[count] = b
+        source[count] = label + b
         count += 1
     return count

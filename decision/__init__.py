@@ -1,0 +1,23 @@
+"""What one control step comes to: the action to send, why, and what the robot's monitor remembers of it.
+
+Every room speaks these types: the filter fills them, the monitor adds the risk score and the gate, the
+service sends one row of them, its client gives that row back, and the evaluation counts them.
+"""
+
+from decision.decision import SAFE_ACTION, Decision, Decisions, Mode, OpenedBy, Origin
+from decision.memory import MEMORY, PLAN_STEPS, Memory, memory_from_json, memory_to_json, next_of_plan
+
+__all__ = [
+    "MEMORY",
+    "PLAN_STEPS",
+    "SAFE_ACTION",
+    "Decision",
+    "Decisions",
+    "Memory",
+    "Mode",
+    "OpenedBy",
+    "Origin",
+    "memory_from_json",
+    "memory_to_json",
+    "next_of_plan",
+]

@@ -1,0 +1,168 @@
+"""One control step of N robots while the filter works on it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from decision import Decisions, Memory, Mode, OpenedBy, Origin, next_of_plan
+from filter import kernel
+from filter.scene import Scene
+from pointgoal.observation import LIDAR_RANGE
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+_MODE = np.array([""], dtype=f"<U{max(map(len, Mode))}")
+_ORIGIN = np.array([""], dtype=f"<U{max(map(len, Origin))}")
+
+
+class Step:
+    """What is to be sent, and why, as far as it is decided.
+
+    Attributes:
+        settings: (1,) of `filter.config.SETTINGS`.
+        scene: what is seen.
+        nominal: (N, 2) u1, u2.
+        action: (N, 2) what is to be sent.
+        active: (N,) where the filter may change it.
+        certificates: (N,) of `CERTIFICATE`, the last one looked for: in the end that of ``action``.
+        certified: (N,) whether the nominal action has one.
+        need: (N,) clearance [m] that certifies what the filter puts in place of a refused action: 0, or what
+            there is, if that is a little less: a robot that has lost a millimetre may keep what it has.
+        memory: (N,) of `MEMORY`, becomes the next call's.
+    """
+
+    def __init__(
+        self, settings: NDArray[np.void], scene: Scene, nominal: FloatArray, memory: Memory, active: BoolArray
+    ) -> None:
+        n = len(nominal)
+        self.settings = settings
+        self.scene = scene
+        self.nominal = nominal
+        self.action = nominal.copy()
+        self.active = active
+        # Where the gate is closed: what the best backup from here keeps.
+        self.certificates = scene.seen["now"].copy()
+        self.certified = np.zeros(n, np.bool_)
+        self.memory = memory.copy()
+        self.memory["side"] -= np.sign(memory["side"])
+        self._planned = np.ones(n, np.bool_)
+        self._mode = np.full(n, Mode.NOMINAL, _MODE.dtype)
+        self._origin = np.zeros(n, _ORIGIN.dtype)
+        self._hazard = np.full(n, -1)
+        self._reason: list[str | None] = [None] * n
+        one = settings[0]
+        inner = 0.5 * max(one["margin"] - one["sure"], 0.0)
+        self.need = np.minimum(np.maximum(scene.barrier, -inner), 0.0)
+
+    def certify(self, rows: IntArray, action: FloatArray, least: FloatArray) -> BoolArray:
+        """Whether some rows' actions (n, 2) have certificates that keep so much clearance (n,) [m]."""
+        scene = self.scene
+        kernel.certify(self.settings, scene.seen, scene.obstacles, rows, action, least, self.certificates)
+        return np.asarray(self.certificates["clearance"][rows] >= least)
+
+    def reference(self, rows: IntArray) -> FloatArray:
+        """What some rows' robots would be sent (n, 2), in the QP's variables."""
+        reference = self.action[rows]
+        reference[:, 0] /= self.settings["robot"]["force_limit"][0]
+        return np.minimum(np.maximum(reference, -1.0), 1.0)
+
+    def nearest(self, rows: IntArray) -> IntArray:
+        """The obstacles (n,) that bound some rows' last certificates; 0 where there is none."""
+        return np.maximum(self.certificates["nearest"][rows], 0)
+
+    def search(self, rows: IntArray) -> FloatArray:
+        """Look on a grid for the certified actions (n, 2) nearest to some rows'; see `kernel.search`."""
+        scene, found = self.scene, self.action[rows]
+        wanted = self.reference(rows)
+        kernel.search(
+            self.settings, scene.seen, scene.obstacles, rows, wanted, self.need, found, self.certificates
+        )
+        return found
+
+    def recover(self, rows: IntArray) -> tuple[FloatArray, NDArray[np.int8]]:
+        """The actions (n, 2) that leave the most clearance or lead out, and what they are (n,), see `kernel`."""
+        scene, found = self.scene, np.empty((len(rows), 2))
+        outcome = np.empty(len(rows), np.int8)
+        radius = self.settings["hazard_radius"][0]
+        with np.errstate(invalid="ignore"):
+            away = np.hypot(scene.given[rows, :, 0], scene.given[rows, :, 1])
+        edge = np.fmin.reduce(away, axis=1, initial=np.inf)
+        if scene.readings.shape[1]:
+            # A scan tells how far the nearest hazard is, though not where.
+            edge = np.minimum(edge, LIDAR_RANGE * (1.0 - scene.readings[rows].max(axis=1)))
+        kernel.recover(
+            self.settings,
+            scene.seen,
+            scene.obstacles,
+            rows,
+            edge - radius,
+            found,
+            self.certificates,
+            outcome,
+        )
+        return found, outcome
+
+    def by_scan(self, rows: IntArray) -> BoolArray:
+        """Whether what bounds some rows' best backups is a place that a scan leaves possible (n,)."""
+        at = np.maximum(self.scene.seen["now"]["nearest"][rows], 0)
+        return np.asarray(self.scene.source[rows, at] >= self.scene.given.shape[1])
+
+    def send(
+        self, rows: IntArray, action: FloatArray, mode: Mode, origin: Origin, reason: str | None = None
+    ) -> None:
+        """Send another action (n, 2) to some rows' robots than the nominal one."""
+        self.action[rows] = action
+        self._mode[rows] = mode
+        self._origin[rows] = origin
+        for k in rows if reason is not None else ():
+            self._reason[k] = reason
+
+    def blame(self, rows: IntArray) -> None:
+        """Name the hazards that bound some rows' last certificates as what the interventions come from."""
+        self._hazard[rows] = self.scene.source[rows, self.nearest(rows)]
+
+    def name_hazard(self, rows: IntArray, hazard: IntArray) -> None:
+        """Name the hazards (n,) that some rows' interventions come from, -1 for none."""
+        self._hazard[rows] = hazard
+
+    def go_on(self, rows: IntArray, reason: str) -> None:
+        """Send the next action of some rows' plans."""
+        action, self.memory[rows] = next_of_plan(self.memory[rows])
+        self.send(rows, action, Mode.FALLBACK, Origin.PLAN, reason)
+        self._planned[rows] = False
+
+    def forget(self, rows: IntArray) -> None:
+        """Leave some rows without a plan."""
+        self.memory["left"][rows] = 0
+        self._planned[rows] = False
+
+    def decisions(self) -> Decisions:
+        """The step, decided, and the plans that the certificates end in written down."""
+        n = len(self.action)
+        rows, memory = np.flatnonzero(self._planned), self.memory
+        kernel.keep_plans(
+            self.settings,
+            self.scene.seen,
+            rows,
+            self.action,
+            self.certificates,
+            memory["left"],
+            memory["plan"],
+        )
+        return Decisions(
+            action=self.action,
+            nominal_action=self.nominal,
+            mode=self._mode,
+            origin=self._origin,
+            certified=self.certified,
+            barrier=self.scene.barrier,
+            hazard=self._hazard,
+            reason=self._reason,
+            risk=np.full(n, np.nan),
+            threshold=np.nan,
+            opened_by=np.where(self.active, OpenedBy.ALWAYS, ""),
+            memory=self.memory,
+        )

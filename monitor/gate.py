@@ -1,0 +1,57 @@
+"""The gate: when the filter is active."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from decision import OpenedBy
+from monitor.errors import MonitorError
+
+FloatArray = NDArray[np.float64]
+
+GateName = Literal["risk", "always", "off"]
+"""When the filter is active: where the risk score or the barrier asks for it, always, never."""
+GATES: tuple[GateName, ...] = get_args(GateName)
+
+
+@dataclass(frozen=True)
+class Gate:
+    """Opens early where the risk score is high, and at the latest where the barrier is low.
+
+    Attributes:
+        name: `risk` opens where risk > threshold, and where the barrier is below the floor, whatever the risk
+            says; `always` and `off` look at neither.
+        threshold: finite and at least 0.
+        floor: the barrier [m] from which no single nominal action can lead below 0, see `filter.floor`.
+
+    Raises:
+        MonitorError: for an unknown name or a threshold that is none.
+    """
+
+    name: GateName
+    threshold: float
+    floor: float
+
+    def __post_init__(self) -> None:
+        """Refuse what is no gate."""
+        if self.name not in GATES:
+            raise MonitorError(f"gate must be one of {', '.join(GATES)}, got {self.name!r}")
+        if not (math.isfinite(self.threshold) and self.threshold >= 0.0):
+            raise MonitorError(f"threshold must be finite and at least 0, got {self.threshold}")
+
+    def opened_by(self, risk: FloatArray, barrier: FloatArray) -> NDArray[np.str_]:
+        """What opens the gate for N robots: texts of `OpenedBy`, "" where it stays closed.
+
+        Args:
+            risk: (N,) the risk score; NaN opens the gate.
+            barrier: (N,) [m]; NaN opens the gate.
+        """
+        if self.name != "risk":
+            return np.full(len(risk), OpenedBy.ALWAYS if self.name == "always" else "", dtype="<U7")
+        by_risk, by_barrier = ~(risk <= self.threshold), ~(barrier >= self.floor)
+        return np.where(by_risk, OpenedBy.RISK, np.where(by_barrier, OpenedBy.BARRIER, ""))
