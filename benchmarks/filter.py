@@ -18,11 +18,11 @@ import qpsolvers
 import tyro
 from numpy.typing import NDArray
 
-from benchmarks.filter_closed_loop import lidar
 from filter import BarrierFilter, FilterConfig, Mode
 from filter.errors import SolverError
 from filter.qp import Problem
 from filter.solvers import make_solver, planar
+from pointgoal.lidar import encode
 from pointgoal.observation import layout
 
 FloatArray = NDArray[np.float64]
@@ -57,8 +57,8 @@ def scenes(n: int, hazards: int, rng: np.random.Generator) -> tuple[FloatArray, 
     observation = np.zeros((n, layout(1).size))
     observation[:, 3] = rng.uniform(0.0, 0.7, n)
     observation[:, 8] = rng.uniform(-3.0, 3.0, n)
-    observation[:, layout(1).slice("goal_lidar")] = lidar(rng.uniform(-1.5, 1.5, (n, 1, 2)))
-    observation[:, layout(1).slice("hazards_lidar")] = lidar(places)
+    observation[:, layout(1).slice("goal_lidar")] = encode(rng.uniform(-1.5, 1.5, (n, 1, 2)))
+    observation[:, layout(1).slice("hazards_lidar")] = encode(places)
     action = np.stack([np.ones(n), rng.uniform(-1.0, 1.0, n)], axis=1)
     return observation, action, places
 

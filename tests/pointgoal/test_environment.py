@@ -15,6 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pointgoal.environment import PointGoalEnv
+from pointgoal.lidar import encode
 from pointgoal.observation import BIN_WIDTH, LIDAR_BINS, LIDAR_RANGE, layout
 from pointgoal.vector import PointGoalVectorEnv
 
@@ -248,7 +249,9 @@ coordinate = st.floats(-3, 3, allow_nan=False)
 def test_lidar_follows_its_definition(pose: tuple[float, ...], hazards: list[tuple[float, float]]) -> None:
     observation, _ = lidar_environment.reset(options={"state": exact_state(pose=pose, hazards=hazards)})
     readings = observation[layout(1).slice("hazards_lidar")]
-    np.testing.assert_allclose(readings, plain_lidar(lidar_environment.hazards_in_body_frame()), atol=1e-9)
+    centres = lidar_environment.hazards_in_body_frame()
+    np.testing.assert_allclose(readings, plain_lidar(centres), atol=1e-9)
+    np.testing.assert_allclose(encode(centres[None])[0], readings, atol=1e-9)
 
 
 def test_a_bearing_just_below_straight_ahead_reads_in_the_first_bin() -> None:
