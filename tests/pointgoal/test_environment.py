@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from pointgoal.environment import PointGoalEnv
 from pointgoal.lidar import encode
 from pointgoal.observation import BIN_WIDTH, LIDAR_BINS, LIDAR_RANGE, layout
+from pointgoal.seeds import spawn
 from pointgoal.vector import PointGoalVectorEnv
 
 IDS = [f"PointGoal{level}-v0" for level in (0, 1, 2)]
@@ -67,7 +68,7 @@ def test_vector_row_is_the_single_environment(name: str) -> None:
     n, row, seed = 5, 3, 11
     many, single = gymnasium.make_vec(name, num_envs=n), gymnasium.make(name)
     observations, _ = many.reset(seed=seed)
-    observation, _ = single.reset(seed=seed + row)
+    observation, _ = single.reset(seed=spawn(seed, n)[row])
     np.testing.assert_array_equal(observations[row], observation)
     rng = np.random.default_rng(0)
     for _ in range(200):
