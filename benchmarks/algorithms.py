@@ -28,6 +28,7 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
+from pointgoal.seeds import Use
 from trainer import checkpoint
 from trainer.config import FILE as CONFIG
 from trainer.config import Config
@@ -134,8 +135,8 @@ def evaluate(run: Path, episodes: int) -> Result:
 
     trained = TrainedRun(run)
     config = trained.config
-    played = play(trained, episodes, threads=1, hold=config.action_repeat)
-    stepwise = play(trained, episodes, threads=1)
+    played = play(trained, episodes, threads=1, hold=config.action_repeat, use=Use.COMPARISON)
+    stepwise = play(trained, episodes, threads=1, use=Use.COMPARISON)
     columns = read_progress(run)
     last = closing(columns, TAIL)
     if last is None:

@@ -18,12 +18,14 @@ import qpsolvers
 import tyro
 from numpy.typing import NDArray
 
-from benchmarks.filter_closed_loop import lidar
 from filter import BarrierFilter, FilterConfig, Mode
 from filter.errors import SolverError
 from filter.qp import Problem
 from filter.solvers import make_solver, planar
+from pointgoal import seeds
+from pointgoal.lidar import encode
 from pointgoal.observation import layout
+from pointgoal.seeds import Use
 
 FloatArray = NDArray[np.float64]
 
@@ -57,8 +59,8 @@ def scenes(n: int, hazards: int, rng: np.random.Generator) -> tuple[FloatArray, 
     observation = np.zeros((n, layout(1).size))
     observation[:, 3] = rng.uniform(0.0, 0.7, n)
     observation[:, 8] = rng.uniform(-3.0, 3.0, n)
-    observation[:, layout(1).slice("goal_lidar")] = lidar(rng.uniform(-1.5, 1.5, (n, 1, 2)))
-    observation[:, layout(1).slice("hazards_lidar")] = lidar(places)
+    observation[:, layout(1).slice("goal_lidar")] = encode(rng.uniform(-1.5, 1.5, (n, 1, 2)))
+    observation[:, layout(1).slice("hazards_lidar")] = encode(places)
     action = np.stack([np.ones(n), rng.uniform(-1.0, 1.0, n)], axis=1)
     return observation, action, places
 
@@ -78,7 +80,7 @@ def _decisions(
     robot_filter: BarrierFilter, arguments: Arguments, hazards: int, given: bool
 ) -> tuple[float, float, float]:
     """Median time of a decision [us] on which the filter acts, its 99th percentile, and how often it acts."""
-    rng = np.random.default_rng(hazards)
+    rng = seeds.generator(Use.FILTER_SPEED, hazards)
     observation, action, places = scenes(arguments.scenes, hazards, rng)
     times = []
     for k in range(arguments.scenes):
@@ -106,7 +108,7 @@ def _single(arguments: Arguments) -> None:
 
 def _batched(arguments: Arguments) -> None:
     print("\nbatch on one core [decisions a second]")
-    rng = np.random.default_rng(0)
+    rng = seeds.generator(Use.FILTER_SPEED, 0)
     observation, action, places = scenes(arguments.batch, 8, rng)
     robot_filter = BarrierFilter()
     for name, known in (("given", places), ("lidar", None)):
@@ -115,7 +117,7 @@ def _batched(arguments: Arguments) -> None:
 
 
 def _problems(arguments: Arguments) -> list[Problem]:
-    rng = np.random.default_rng(1)
+    rng = seeds.generator(Use.FILTER_SPEED, 1)
     observation, action, places = scenes(4 * arguments.scenes, 8, rng)
     robot_filter = BarrierFilter()
     found = [robot_filter.problem(*one) for one in zip(observation, action, places, strict=True)]

@@ -18,7 +18,9 @@ from mujoco.batch import Batch
 from rich.console import Console
 from rich.table import Table
 
+from pointgoal import seeds
 from pointgoal.scene import PHYSICS_STEPS
+from pointgoal.seeds import Use
 from pointgoal.simulation import EPISODE_STEPS
 from pointgoal.vector import PointGoalVectorEnv
 
@@ -50,13 +52,13 @@ def measure(level: int, num_envs: int, threads: int, settings: Settings) -> Rate
     """Measure one combination; the ratio is the median over pairs of neighbouring stretches."""
     env = PointGoalVectorEnv(level=level, num_envs=num_envs, num_threads=threads)
     elapsed = np.linspace(0, EPISODE_STEPS - 1, num_envs).astype(int)
-    env.reset(seed=0, options={"elapsed_steps": elapsed})
+    env.reset(seed=seeds.rows(Use.SIMULATION_SPEED, 0, num_envs), options={"elapsed_steps": elapsed})
     batch = Batch(env.simulations[0].model, num_envs, nthread=threads, persistent=True)
     control = batch.bind("ctrl")
     batch.bind("sensordata")
     batch.state[...] = np.concatenate([simulation.batch.state for simulation in env.simulations])
     count = max(1, settings.steps // num_envs)
-    actions = np.random.default_rng(0).uniform(-1, 1, (count, num_envs, 2))
+    actions = seeds.generator(Use.SIMULATION_SPEED, 0).uniform(-1, 1, (count, num_envs, 2))
 
     def environment_stretch() -> float:
         start = time.perf_counter()

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from evaluation.deciders import Decided, Decider, FloatArray
 from filter import Mode
+from pointgoal import seeds
+from pointgoal.seeds import Use
 from pointgoal.vector import PointGoalVectorEnv
 
 HazardSource = Literal["given", "lidar"]
@@ -86,17 +88,19 @@ def run_episodes(
     hazards: HazardSource = "given",
     record: bool = False,
     progress: Callable[[int], None] | None = None,
+    use: Use = Use.EVALUATION,
 ) -> Episodes:
-    """Runs episodes to their ends, up to `SIDE_BY_SIDE` at once; episode i is seeded with seed + i.
+    """Runs episodes to their ends, up to `SIDE_BY_SIDE` at once; episode i takes `seeds.rows` number i.
 
     Args:
         task: gymnasium id of the task.
         decider: who decides.
         episodes: how many, at least 1.
-        seed: of the first episode.
+        seed: of the layouts; another one has none of them in common.
         hazards: what the filter knows of the hazards.
         record: whether to keep the trajectory; then all of them must fit side by side.
         progress: called with the count of steps that all robots made since the last call.
+        use: what for; together with the seed it says which layouts.
 
     Raises:
         ValueError: if there is no episode to run, or too many to record.
@@ -106,8 +110,9 @@ def run_episodes(
         raise ValueError(f"episodes must be at least 1, got {episodes}")
     if record and episodes > SIDE_BY_SIDE:
         raise ValueError(f"at most {SIDE_BY_SIDE} episodes can be recorded, got {episodes}")
+    rows, rng = seeds.rows(use, seed, episodes), seeds.generator(use, seed)
     parts = [
-        _run(task, decider, min(SIDE_BY_SIDE, episodes - first), seed + first, hazards, record, progress)
+        _run(task, decider, rows[first : first + SIDE_BY_SIDE], rng, hazards, record, progress)
         for first in range(0, episodes, SIDE_BY_SIDE)
     ]
     return Episodes(
@@ -125,17 +130,18 @@ def run_episodes(
 def _run(
     task: str,
     decider: Decider,
-    count: int,
-    seed: int,
+    rows: list[int],
+    rng: np.random.Generator,
     hazards: HazardSource,
     record: bool,
     progress: Callable[[int], None] | None,
 ) -> Episodes:
+    count = len(rows)
     env = _make(task, count)
     try:
-        tally = _Tally(env, count, record, np.random.default_rng(seed))
+        tally = _Tally(env, count, record, rng)
         decider.start(count)
-        observation, _ = env.reset(seed=[seed + i for i in range(count)])
+        observation, _ = env.reset(seed=rows)
         while tally.running.any():
             given = env.hazards_in_body_frame() if hazards == "given" else None
             decided = decider.decide(observation, given)

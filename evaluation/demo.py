@@ -26,6 +26,7 @@ from evaluation.tables import summary_table
 from models import Bundle, BundleError
 from monitor import Gate
 from pointgoal.observation import layout
+from pointgoal.seeds import Use
 from pointgoal.simulation import EPISODE_STEPS
 from server import ClientError
 
@@ -50,7 +51,7 @@ class DemoConfig:
     episodes: int = 20
     """How many episodes for each gate, the same ones."""
     seed: int = 0
-    """Seed of the first episode; the others count on."""
+    """Seed of the episodes' layouts; another one has none of them in common."""
     timeout: float = 1.0
     """How long a robot waits for its action [s]."""
 
@@ -120,6 +121,7 @@ def _drive_through(gate: Gate, bundle: Bundle, config: DemoConfig, console: Cons
             config.seed,
             record=True,
             progress=lambda steps: bar.advance(job, steps),
+            use=Use.DEMO,
         )
 
 

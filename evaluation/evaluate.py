@@ -53,7 +53,7 @@ class EvaluateConfig:
     task: str | None = None
     """Gymnasium id of the task; by default the bundle's."""
     seed: int = 0
-    """Seed of the first episode; the others count on."""
+    """Seed of the episodes' layouts; another one has none of them in common."""
     url: str | None = None
     """A running service to ask, for example http://127.0.0.1:8000."""
     timeout: float = 1.0

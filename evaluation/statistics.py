@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from scipy.stats import beta
+from scipy.stats import binomtest
 
 from evaluation.closed_loop import Episodes
 from filter import Mode
@@ -103,7 +103,5 @@ def clopper_pearson(hits: int, trials: int, confidence: float = CONFIDENCE) -> t
     """
     if not (trials >= 1 and 0 <= hits <= trials and 0.0 < confidence < 1.0):
         raise ValueError(f"no binomial interval of {hits} in {trials} with confidence {confidence}")
-    tail = (1.0 - confidence) / 2.0
-    low = float(beta.ppf(tail, hits, trials - hits + 1)) if hits > 0 else 0.0
-    high = float(beta.ppf(1.0 - tail, hits + 1, trials - hits)) if hits < trials else 1.0
-    return low, high
+    low, high = binomtest(hits, trials).proportion_ci(confidence, method="exact")
+    return float(low), float(high)

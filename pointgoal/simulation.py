@@ -13,16 +13,8 @@ from mujoco.batch import Batch
 from numpy.typing import NDArray
 
 from pointgoal.layouts import sample_goal, sample_layout
-from pointgoal.observation import (
-    BIN_WIDTH,
-    HAZARD_RADIUS,
-    LIDAR_BINS,
-    LIDAR_RANGE,
-    NUM_HAZARDS,
-    NUM_VASES,
-    FloatArray,
-    layout,
-)
+from pointgoal.lidar import show
+from pointgoal.observation import HAZARD_RADIUS, LIDAR_BINS, NUM_HAZARDS, NUM_VASES, FloatArray, layout
 from pointgoal.scene import PHYSICS_STEPS, ROBOT_QPOS, VASE_HEIGHT, VASE_QPOS, VASE_QVEL, build_scene
 
 BoolArray = NDArray[np.bool_]
@@ -302,17 +294,8 @@ class Simulation:
         """(n, 28 or 60) observations from the sensors and the offsets (n, k) of what the lidars see."""
         observation = np.zeros((self.n, self.layout.size))
         observation[:, :_SENSOR_NUMBERS] = self._sensors[:, :_SENSOR_NUMBERS]
-        bearing = (np.arctan2(dy, dx) - self._qpos[:, 2:3]) * (1.0 / BIN_WIDTH)
-        np.remainder(bearing, LIDAR_BINS, out=bearing)
-        ahead = bearing.astype(np.int64)
-        alias = bearing - ahead
-        # A bearing of -1e-17 has remainder 16.0: the mask wraps it to bin 0, as it wraps the neighbours.
-        last = LIDAR_BINS - 1
-        reading = np.maximum(LIDAR_RANGE - distance, 0.0) / LIDAR_RANGE
-        flat = observation.reshape(-1)
-        np.maximum.at(flat, self._lidar_start + (ahead & last), reading)
-        np.maximum.at(flat, self._lidar_start + (ahead + 1 & last), alias * reading)
-        np.maximum.at(flat, self._lidar_start + (ahead - 1 & last), (1.0 - alias) * reading)
+        bearing = np.arctan2(dy, dx) - self._qpos[:, 2:3]
+        show(observation.reshape(-1), self._lidar_start, bearing, distance)
         return observation
 
     def state_dict(self) -> dict[str, np.ndarray]:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from pointgoal.observation import FloatArray, ObservationLayout, layout
 from pointgoal.rendering import draw
 from pointgoal.scene import build_scene
+from pointgoal.seeds import spawn
 from pointgoal.simulation import EPISODE_STEPS, CostKind, Simulation, State, StepResult
 
 
@@ -44,7 +45,7 @@ class PointGoalVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
     ``info["cost"]`` (N,) is the cost of the step. On a step on which episodes end, the observations
     returned are the next episodes' first ones; ``info["final_obs"]`` (N, size) holds the last ones in
     the rows that ``info["_final_obs"]`` (N,) marks, and ``info["final_info"]`` their cost.
-    Row i seeded with s is the single environment seeded with s + i.
+    Row i seeded with s is the single environment seeded with ``pointgoal.seeds.spawn(s, N)[i]``.
 
     Args:
         level: 0, 1 or 2.
@@ -95,8 +96,9 @@ class PointGoalVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
         """Start new episodes.
 
         Args:
-            seed: one number s (row i takes s + i), or one a row, or None to go on with the generators; rows
-                that are not reset keep theirs.
+            seed: one number, whose children (`pointgoal.seeds.spawn`) the rows take, or one a row, taken as
+                the single environment takes it, or None to go on with the generators; rows that are not
+                reset keep theirs.
             options: ``"state"``: an exact state (pose, velocity, goal, hazards, vase_qpos, vase_qvel,
                 each with leading axis N); ``"reset_mask"`` (N,) bool: the rows to reset, the others stay
                 as they are; ``"elapsed_steps"`` (N,) int: how far into its episode each row starts, to
@@ -245,8 +247,10 @@ class PointGoalVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
         if seed is None and self._started:
             return
         seeds: list[int | None]
-        if seed is None or isinstance(seed, int | np.integer):
-            seeds = [None if seed is None else int(seed) + i for i in range(self.num_envs)]
+        if seed is None:
+            seeds = [None] * self.num_envs
+        elif isinstance(seed, int | np.integer):
+            seeds = [*spawn(int(seed), self.num_envs)]
         else:
             seeds = [None if number is None else operator.index(number) for number in seed]
         if len(seeds) != self.num_envs:

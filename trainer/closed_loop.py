@@ -1,6 +1,6 @@
 """Deterministic episodes of a policy in the task, without noise and without filter."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -36,28 +36,30 @@ class Episodes:
         return np.asarray(np.nansum(self.cost, 0))
 
 
-def episodes(env: VectorEnv[Any, Any, Any], policy: Policy, count: int, steps: int, seed: int) -> Episodes:
-    """Runs whole episodes, env.num_envs at a time.
+def episodes(env: VectorEnv[Any, Any, Any], policy: Policy, seeds: Sequence[int], steps: int) -> Episodes:
+    """Runs one whole episode for each seed, env.num_envs at a time.
 
     Args:
         env: with autoreset in the same step.
         policy: observations [N, n] → actions [N, a] within bounds.
-        count: episodes wanted.
+        seeds: of the layouts [E].
         steps: longest an episode may last [steps].
-        seed: of the first layout; the next ones take the following numbers.
 
     Returns:
-        Exactly `count` episodes.
+        The E episodes, in the seeds' order.
     """
-    parts = [_batch(env, policy, steps, seed + first) for first in range(0, count, env.num_envs)]
+    count = len(seeds)
+    # Rows to spare in the last batch repeat the first episodes, and are dropped.
+    rows = np.arange(-(-count // env.num_envs) * env.num_envs).reshape(-1, env.num_envs) % count
+    parts = [_batch(env, policy, steps, [seeds[i] for i in batch]) for batch in rows]
     reward, cost, observation = (np.concatenate(part, axis=1)[:, :count] for part in zip(*parts, strict=True))
     return Episodes(reward, cost, observation)
 
 
 def _batch(
-    env: VectorEnv[Any, Any, Any], policy: Policy, steps: int, seed: int
+    env: Any, policy: Policy, steps: int, seeds: list[int]
 ) -> tuple[npt.NDArray[Any], npt.NDArray[Any], npt.NDArray[Any]]:
-    observation, _ = env.reset(seed=seed)
+    observation, _ = env.reset(seed=seeds)
     reward = np.full((steps, env.num_envs), np.nan)
     cost = np.full((steps, env.num_envs), np.nan)
     seen = np.full((steps, *observation.shape), np.nan, np.float32)

@@ -18,7 +18,9 @@ import tyro
 from rich.console import Console
 
 from models import BundleError, Manifest, ObservationBlock, write_bundle
+from pointgoal import seeds
 from pointgoal.observation import HAZARD_RADIUS, layout
+from pointgoal.seeds import Use
 from trainer import checkpoint, onnx_graph
 from trainer.actions import ActionRange
 from trainer.algorithms import ALGORITHMS, prepare_environments
@@ -35,8 +37,6 @@ TOLERANCE = 1e-5
 """Largest difference between torch and onnxruntime; relative to the value where that is above 1."""
 CHECKED = 1000
 """Real observations on which both are compared."""
-SEED = 10_000
-"""Added to the run's seed for the calibration's layouts, which training never saw."""
 ENVIRONMENTS = 50
 NO_NETWORK = 1.0
 """λ of an algorithm without a multiplier network: no state is told from another."""
@@ -145,7 +145,7 @@ def export(config: ExportConfig) -> Manifest:
     policy, multiplier = run.graphs()
     played = play(run, config.episodes, config.threads)
     seen = played.observation[np.isfinite(played.observation).all(-1)]
-    rng = np.random.default_rng(0)
+    rng = seeds.generator(Use.CALIBRATION, run.config.seed)
     differences = compare(
         run, policy, multiplier, seen[rng.choice(len(seen), min(CHECKED, len(seen)), False)]
     )
@@ -171,7 +171,7 @@ def export(config: ExportConfig) -> Manifest:
     return write_bundle(config.bundle, policy, multiplier, manifest).manifest
 
 
-def play(run: TrainedRun, count: int, threads: int, hold: int = 1) -> Episodes:
+def play(run: TrainedRun, count: int, threads: int, hold: int = 1, use: Use = Use.CALIBRATION) -> Episodes:
     """Deterministic closed-loop episodes of a run's policy on layouts that training never saw.
 
     Args:
@@ -179,6 +179,7 @@ def play(run: TrainedRun, count: int, threads: int, hold: int = 1) -> Episodes:
         count: episodes.
         threads: of the simulation.
         hold: control steps that a decision is held for; the episodes' steps are decisions then.
+        use: what for; together with the run's seed it says which layouts.
     """
     act = run.policy()
     features = run.learner.features
@@ -187,9 +188,8 @@ def play(run: TrainedRun, count: int, threads: int, hold: int = 1) -> Episodes:
         return episodes(
             env,
             lambda observation: run.range.sent(act(features(observation))),
-            count,
+            seeds.rows(use, run.config.seed, count),
             run.config.episode_steps // hold,
-            SEED + run.config.seed,
         )
 
 

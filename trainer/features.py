@@ -6,7 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from pointgoal.observation import BIN_WIDTH, LIDAR_BINS, LIDAR_RANGE, layout
+from pointgoal.lidar import TINY, nearest, places
+from pointgoal.observation import BIN_WIDTH, LIDAR_BINS, layout
 from trainer.config import Config
 from trainer.normaliser import Normaliser
 
@@ -16,7 +17,6 @@ COASTING = 0.519
 """Decay time of the robot's speed without thrust [s], which coasts this times its velocity."""
 SHARPNESS = 12.0
 """Concentration of the map's directions: a hazard shows in those within about 1/√12 rad of its own."""
-TINY = 1e-6
 Floats = npt.NDArray[np.float32]
 DIRECTIONS: Floats = np.arange(LIDAR_BINS, dtype=np.float32) * np.float32(BIN_WIDTH)
 """The map's directions from the goal's, counter-clockwise [rad]."""
@@ -40,8 +40,7 @@ class Surroundings:
     5. twice the unit vector to the goal (ahead, left), GAIN · exp(−its distance / 1 m), and GAIN times the
        way on which the robot would coast (along that vector, to the left of it).
 
-    An object's distance is its reading's, its bearing within the bin the middle of what the neighbours'
-    readings leave possible: exact for an object alone. A goal out of sight has no direction and no nearness.
+    Where an object is, `pointgoal.lidar.places` says. A goal out of sight has no direction and no nearness.
 
     Attributes:
         hazards: where the hazards' readings stand in the observation.
@@ -63,7 +62,7 @@ class Surroundings:
     def __call__(self, observation: Floats) -> Floats:
         """The numbers [..., size] for raw observations [..., n], of the same precision."""
         hazards = observation[..., self.hazards]
-        x, y, distance = _places(hazards)
+        x, y, distance = places(hazards)
         ux, uy, away, seen = _goal(observation[..., self.goal])
         coast = observation[..., self.velocity] * np.float32(COASTING)
         cx, cy = coast[..., :1], coast[..., 1:]
@@ -88,21 +87,9 @@ class Surroundings:
         return shown
 
 
-def _places(reading: Floats) -> tuple[Floats, Floats, Floats]:
-    """Place x, y and distance [m] of the object in every bin of a lidar [..., bins]."""
-    distance = (1 - reading) * np.float32(LIDAR_RANGE)
-    divisor = np.maximum(reading, np.float32(TINY))
-    upper = np.minimum(np.roll(reading, -1, -1) / divisor, 1)
-    lower = np.maximum(1 - np.roll(reading, 1, -1) / divisor, 0)
-    bearing = (np.arange(LIDAR_BINS, dtype=np.float32) + (lower + upper) / 2) * np.float32(BIN_WIDTH)
-    return distance * np.cos(bearing), distance * np.sin(bearing), distance
-
-
 def _goal(reading: Floats) -> tuple[Floats, Floats, Floats, Floats]:
     """Of the only object: unit vector x, y (0 out of sight), distance [m], 1 in sight, else 0 [..., 1]."""
-    top = reading.argmax(-1)[..., None]
-    x, y, distance = (np.take_along_axis(of, top, -1) for of in _places(reading))
-    seen: Floats = np.take_along_axis(np.sign(reading), top, -1)
+    x, y, distance, seen = nearest(reading)
     divisor: Floats = np.maximum(distance, np.float32(TINY))
     return seen * x / divisor, seen * y / divisor, distance, seen
 

@@ -9,9 +9,10 @@ import numpy.typing as npt
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
+from pointgoal.lidar import TINY
 from pointgoal.observation import BIN_WIDTH, LIDAR_BINS, LIDAR_RANGE
 from trainer.actions import RAMP, ActionRange
-from trainer.features import COASTING, DIRECTIONS, GAIN, SHARPNESS, TINY, Features, Surroundings
+from trainer.features import COASTING, DIRECTIONS, GAIN, SHARPNESS, Features, Surroundings
 from trainer.networks import HIDDEN, Shape
 from trainer.normaliser import CLIP
 
@@ -76,7 +77,7 @@ class _Builder:
         return self.last
 
     def places(self, reading: str) -> tuple[str, str, str]:
-        """features._places."""
+        """pointgoal.lidar.places."""
         zero, half, one = self.constant(0.0), self.constant(0.5), self.constant(1.0)
         distance = self.chain(reading, ("Neg",), ("Add", one), ("Mul", self.constant(LIDAR_RANGE)))
         divisor = self.chain(reading, ("Max", self.constant(TINY)))

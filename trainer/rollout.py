@@ -9,6 +9,8 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.vector import VectorEnv
 
+from pointgoal import seeds
+from pointgoal.seeds import Use
 from trainer.actions import ActionRange
 from trainer.config import Config
 from trainer.features import Features
@@ -100,7 +102,9 @@ class Rollout:
         self.actions = actions
         elapsed = np.arange(env.num_envs) * config.episode_steps // env.num_envs
         elapsed -= elapsed % config.action_repeat
-        observation, _ = env.reset(seed=config.seed, options={"elapsed_steps": elapsed})
+        seeded: Any = env  # gymnasium types the seed as one number, its vector environments take one a row
+        layouts = seeds.rows(Use.TRAINING, config.seed, env.num_envs)
+        observation, _ = seeded.reset(seed=layouts, options={"elapsed_steps": elapsed})
         self._observation = np.asarray(observation, np.float32)
         self._return = np.zeros(env.num_envs)
         self._cost = np.zeros(env.num_envs)

@@ -20,6 +20,8 @@ from gymnasium.spaces import Box
 from gymnasium.vector import VectorEnv
 from rich.console import Console
 
+from pointgoal import seeds
+from pointgoal.seeds import Use
 from trainer import checkpoint
 from trainer.actions import action_range
 from trainer.algorithms import ALGORITHMS, prepare_environments
@@ -84,7 +86,7 @@ class Run:
     def __init__(self, config: Config, folder: Path, env: Environments) -> None:
         self.config = config
         self.folder = folder
-        self.rng = np.random.default_rng(config.seed)
+        self.rng = seeds.generator(Use.TRAINING, config.seed)
         self.actions = action_range(config, _box(env.single_action_space))
         seen = _box(env.single_observation_space)
         self.learner = Learner(config, seen.shape[0], self.actions, self.rng)

@@ -13,12 +13,13 @@ from evaluation.deciders import OverHttp
 from evaluation.service import Service
 from filter import Mode
 from pointgoal.observation import HAZARD_RADIUS, layout
+from pointgoal.seeds import Use, rows
 
 
 def test_each_episode_is_that_of_a_single_environment(full_thrust) -> None:
     env = gymnasium.make("PointGoal1-v0")
-    for i in range(3):
-        env.reset(seed=7 + i)
+    for i, seed in enumerate(rows(Use.EVALUATION, 7, 3)):
+        env.reset(seed=seed)
         total, cost, violating = 0.0, 0.0, 0
         for _ in range(1000):
             _, reward, _, truncated, info = env.step(np.array([1.0, 0.25]))

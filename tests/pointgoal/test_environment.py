@@ -15,7 +15,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pointgoal.environment import PointGoalEnv
+from pointgoal.lidar import encode
 from pointgoal.observation import BIN_WIDTH, LIDAR_BINS, LIDAR_RANGE, layout
+from pointgoal.seeds import spawn
 from pointgoal.vector import PointGoalVectorEnv
 
 IDS = [f"PointGoal{level}-v0" for level in (0, 1, 2)]
@@ -66,7 +68,7 @@ def test_vector_row_is_the_single_environment(name: str) -> None:
     n, row, seed = 5, 3, 11
     many, single = gymnasium.make_vec(name, num_envs=n), gymnasium.make(name)
     observations, _ = many.reset(seed=seed)
-    observation, _ = single.reset(seed=seed + row)
+    observation, _ = single.reset(seed=spawn(seed, n)[row])
     np.testing.assert_array_equal(observations[row], observation)
     rng = np.random.default_rng(0)
     for _ in range(200):
@@ -248,7 +250,9 @@ coordinate = st.floats(-3, 3, allow_nan=False)
 def test_lidar_follows_its_definition(pose: tuple[float, ...], hazards: list[tuple[float, float]]) -> None:
     observation, _ = lidar_environment.reset(options={"state": exact_state(pose=pose, hazards=hazards)})
     readings = observation[layout(1).slice("hazards_lidar")]
-    np.testing.assert_allclose(readings, plain_lidar(lidar_environment.hazards_in_body_frame()), atol=1e-9)
+    centres = lidar_environment.hazards_in_body_frame()
+    np.testing.assert_allclose(readings, plain_lidar(centres), atol=1e-9)
+    np.testing.assert_allclose(encode(centres[None])[0], readings, atol=1e-9)
 
 
 def test_a_bearing_just_below_straight_ahead_reads_in_the_first_bin() -> None:

@@ -30,7 +30,7 @@ class TinyTask(gymnasium.vector.VectorEnv):
     def _observe(self) -> np.ndarray:
         return np.stack([self.x, self.elapsed / STEPS], 1)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
+    def reset(self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None):
         self.rng = np.random.default_rng(seed)
         self.elapsed = np.array((options or {}).get("elapsed_steps", np.zeros(self.num_envs, np.int64)))
         self.x = self.rng.uniform(-1, 1, self.num_envs)

@@ -5,6 +5,7 @@ from gymnasium.spaces import Box
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pointgoal.lidar import encode
 from pointgoal.observation import layout
 from trainer.actions import action_range
 from trainer.config import Config
@@ -35,11 +36,9 @@ def test_surroundings_belong_to_tasks_with_hazards(task, numbers):
 
 def show(observation, lidar, distance, bearing):
     """Puts an object into a lidar as the simulation does; returns its bin."""
-    place = np.remainder(bearing, 2 * np.pi) * 8 / np.pi
-    b, share, reading = int(place) % 16, place - int(place), 1 - distance / 3
-    for k, value in ((b, reading), (b + 1, share * reading), (b - 1, (1 - share) * reading)):
-        observation[lidar.start + k % 16] = value
-    return b
+    (shown,) = encode(place(distance, bearing)[None, None])
+    observation[lidar] = np.maximum(observation[lidar], shown)
+    return int(shown.argmax())
 
 
 def place(distance, bearing):

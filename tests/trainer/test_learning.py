@@ -11,7 +11,7 @@ BEST = 10 + 2 * LIMIT - LIMIT**2 / 10
 SETTINGS = {
     "ppo": {},
     "ppo-lag": {"dual_learning_rate": 0.1, "dual_init": 0.5},
-    "trpo-lag": {"dual_learning_rate": 0.1, "dual_init": 0.5},
+    "trpo-lag": {"dual_learning_rate": 0.1, "dual_init": 1.0},
     "cppo-pid": {"pid_ki": 0.03},
     "ipo": {},
     "cpo": {},

@@ -30,10 +30,11 @@ class MaximumCost(VectorWrapper):
         )
 
     def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[npt.NDArray[Any], dict[str, Any]]:
         """Resets all episodes."""
-        observation, info = self.env.reset(seed=seed, options=options)
+        env: Any = self.env
+        observation, info = env.reset(seed=seed, options=options)
         self._maximum = np.zeros(self.num_envs)
         return self._augmented(observation), info
 
