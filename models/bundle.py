@@ -13,6 +13,7 @@ from pydantic import ValidationError
 
 from models.errors import BundleError
 from models.graph import FLOAT, Graph, Tensor, check_graph, read_graph
+from models.join import join
 from models.manifest import FORMAT_VERSION, MANIFEST_FILE, MULTIPLIER_FILE, POLICY_FILE, Manifest
 
 
@@ -45,6 +46,17 @@ class Bundle:
     def multiplier_path(self) -> Path:
         """Where multiplier.onnx lies."""
         return self.path / MULTIPLIER_FILE
+
+    def joined(self) -> bytes:
+        """Both networks as one graph, "observation" → "action" and "multiplier", bit for bit as apart.
+
+        Raises:
+            BundleError: if a graph has subgraphs or functions.
+        """
+        try:
+            return join((self.policy, self.multiplier))
+        except BundleError as error:
+            raise BundleError(f"{self.path}: {error}") from error
 
     @staticmethod
     def load(path: str | Path) -> Bundle:
