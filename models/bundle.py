@@ -12,7 +12,8 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from models.errors import BundleError
-from models.graph import FLOAT, Tensor, read_graph
+from models.graph import FLOAT, Graph, Tensor, check_graph, read_graph
+from models.join import join
 from models.manifest import FORMAT_VERSION, MANIFEST_FILE, MULTIPLIER_FILE, POLICY_FILE, Manifest
 
 
@@ -46,6 +47,17 @@ class Bundle:
         """Where multiplier.onnx lies."""
         return self.path / MULTIPLIER_FILE
 
+    def joined(self) -> bytes:
+        """Both networks as one graph, "observation" → "action" and "multiplier", bit for bit as apart.
+
+        Raises:
+            BundleError: if a graph has subgraphs or functions.
+        """
+        try:
+            return join((self.policy, self.multiplier))
+        except BundleError as error:
+            raise BundleError(f"{self.path}: {error}") from error
+
     @staticmethod
     def load(path: str | Path) -> Bundle:
         """Loads a bundle and checks everything that can be checked without running it.
@@ -55,8 +67,8 @@ class Bundle:
 
         Raises:
             BundleError: one line that names the file and what is wrong: a file is missing, the manifest is
-                malformed or of another format version, a digest differs, a graph is no ONNX, keeps data
-                outside the file, uses another opset than stated, or has other inputs or outputs than the
+                malformed or of another format version, a digest differs, a graph is no valid ONNX, keeps
+                data outside the file, uses another opset than stated, or has other inputs or outputs than the
                 layout asks for.
         """
         folder = Path(path)
@@ -190,16 +202,21 @@ def _read_checked(path: Path, manifest: Manifest) -> bytes:
 
 def _check_graph(path: Path, data: bytes, manifest: Manifest, output: Tensor) -> None:
     try:
-        graph = read_graph(data)
+        _compare(read_graph(data), manifest, output)
+        check_graph(data)
     except BundleError as error:
         raise BundleError(f"{path}: {error}") from error
+
+
+def _compare(graph: Graph, manifest: Manifest, output: Tensor) -> None:
+    """Holds what a graph declares against what the manifest asks for."""
     observation = Tensor("observation", FLOAT, (None, manifest.observation_size))
     if graph.external:
-        raise BundleError(f"{path}: keeps tensors outside the file (ONNX external data), which is refused")
+        raise BundleError("keeps tensors outside the file (ONNX external data), which is refused")
     if graph.opsets != {"": manifest.opset}:
         stated = ", ".join(f"{domain or 'ai.onnx'} {version}" for domain, version in graph.opsets.items())
-        raise BundleError(f"{path}: uses opset {stated}, the manifest says ai.onnx {manifest.opset}")
+        raise BundleError(f"uses opset {stated}, the manifest says ai.onnx {manifest.opset}")
     for what, found, expected in (("input", graph.inputs, observation), ("output", graph.outputs, output)):
         if found != (expected,):
             listed = ", ".join(str(tensor) for tensor in found) or "none"
-            raise BundleError(f"{path}: {what} is {listed}, expected {expected}")
+            raise BundleError(f"{what} is {listed}, expected {expected}")

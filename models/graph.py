@@ -1,35 +1,20 @@
-"""What an ONNX file declares, read straight from its protobuf bytes.
+"""What an ONNX file declares, and whether it is one.
 
-The runtime installs onnxruntime but not onnx, and onnxruntime tells neither the opset nor whether a tensor
-lives in another file (it would open that file, relative to the working directory). Both must be known before
-a session sees the bytes, so this reads the few fields that matter. Field numbers: onnx.proto of ONNX 1.17.
+Both must be known before onnxruntime sees the bytes: it tells no opset, and a tensor that says it lives in
+another file it would open there, relative to the working directory.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
+
+import onnx
+from google.protobuf.message import DecodeError, Message
 
 from models.errors import BundleError
 
-FLOAT = 1
+FLOAT = int(onnx.TensorProto.FLOAT)
 """TensorProto.DataType of float32."""
-
-_VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
-_LONGEST_VARINT = 10
-_DEEPEST = 32
-"""Nesting of graphs inside graphs that is still read; an exported MLP has one."""
-
-# Every way from a message down to a tensor: {message: {field: message}}.
-_DESCENT = {
-    "model": {7: "graph", 20: "training", 25: "function"},
-    "graph": {1: "node", 5: "tensor", 15: "sparse"},
-    "node": {5: "attribute"},
-    "attribute": {5: "tensor", 6: "graph", 10: "tensor", 11: "graph", 22: "sparse", 23: "sparse"},
-    "sparse": {1: "tensor", 2: "tensor"},
-    "function": {7: "node", 11: "attribute"},
-    "training": {1: "graph", 2: "graph"},
-}
 
 
 @dataclass(frozen=True)
@@ -77,105 +62,50 @@ def read_graph(data: bytes) -> Graph:
     Raises:
         BundleError: if the bytes are no ONNX model.
     """
-    model = memoryview(data)
-    opsets: dict[str, int] = {}
-    graph: memoryview | None = None
-    for field, value in _fields(model):
-        if field == 8 and isinstance(value, memoryview):
-            entry = dict(_fields(value))
-            domain = _text(entry.get(1))
-            opsets["" if domain == "ai.onnx" else domain] = _integer(entry.get(2))
-        elif field == 7 and isinstance(value, memoryview):
-            graph = value
-    if graph is None or not opsets:
+    try:
+        model = onnx.load_model_from_string(data)
+        graph = model.graph
+        opsets = {"" if o.domain == "ai.onnx" else o.domain: o.version for o in model.opset_import}
+        initialised = {tensor.name for tensor in graph.initializer}
+        inputs = tuple(_tensor(value) for value in graph.input if value.name not in initialised)
+        outputs = tuple(_tensor(value) for value in graph.output)
+    except DecodeError as error:
+        raise BundleError("not an ONNX model, or cut short") from error
+    except UnicodeDecodeError as error:
+        raise BundleError("not an ONNX model: a name in it is no text") from error
+    if not model.HasField("graph") or not opsets:
         raise BundleError("not an ONNX model: it has no graph or no opset")
-    parts = [(field, value) for field, value in _fields(graph) if isinstance(value, memoryview)]
-    initialised = {_text(dict(_fields(value)).get(8)) for field, value in parts if field == 5}
-    inputs = tuple(_tensor(value) for field, value in parts if field == 11)
-    return Graph(
-        opsets=opsets,
-        inputs=tuple(tensor for tensor in inputs if tensor.name not in initialised),
-        outputs=tuple(_tensor(value) for field, value in parts if field == 12),
-        external=_has_external(model, "model", 0),
-    )
+    return Graph(opsets, inputs, outputs, external=_has_external(model))
 
 
-def _has_external(message: memoryview, kind: str, depth: int) -> bool:
-    """Whether a tensor anywhere under a message sets external_data (13) or data_location (14) = EXTERNAL."""
-    if depth > _DEEPEST:
-        raise BundleError(
-            f"not an ONNX model that an exporter writes: nested deeper than {_DEEPEST} messages"
-        )
-    for field, value in _fields(message):
-        if kind == "tensor":
-            if field == 13 or (field == 14 and value != 0):
+def check_graph(data: bytes) -> None:
+    """Has onnx check a model: every operator known, every tensor whole, every input there when it is used.
+
+    Args:
+        data: the file's bytes, without external data, for which this would look at the disk.
+
+    Raises:
+        BundleError: if the model is not valid.
+    """
+    try:
+        onnx.checker.check_model(data)
+    except (onnx.checker.ValidationError, ValueError, RuntimeError) as error:
+        raise BundleError(f"not a valid ONNX model: {error}") from error
+
+
+def _has_external(message: Message) -> bool:
+    """Whether a tensor anywhere in a message, in subgraphs and functions too, lies in another file."""
+    if isinstance(message, onnx.TensorProto):
+        return message.data_location != onnx.TensorProto.DEFAULT or len(message.external_data) > 0
+    for field, value in message.ListFields():
+        if field.message_type is not None:
+            parts = (value,) if isinstance(value, Message) else value
+            if any(_has_external(part) for part in parts):
                 return True
-            continue
-        below = _DESCENT[kind].get(field)
-        if below is not None and isinstance(value, memoryview) and _has_external(value, below, depth + 1):
-            return True
     return False
 
 
-def _tensor(value_info: memoryview) -> Tensor:
-    """A ValueInfoProto: name 1, type 2 → tensor_type 1 → elem_type 1, shape 2 → dim 1 → dim_value 1."""
-    info = dict(_fields(value_info))
-    tensor = dict(_fields(_message(dict(_fields(_message(info.get(2)))).get(1))))
-    sizes: list[int | None] = []
-    for field, value in _fields(_message(tensor.get(2))):
-        if field == 1:
-            size = dict(_fields(_message(value))).get(1)
-            sizes.append(size if isinstance(size, int) else None)
-    return Tensor(name=_text(info.get(1)), dtype=_integer(tensor.get(1)), shape=tuple(sizes))
-
-
-def _message(value: int | memoryview | None) -> memoryview:
-    return value if isinstance(value, memoryview) else memoryview(b"")
-
-
-def _text(value: int | memoryview | None) -> str:
-    return bytes(_message(value)).decode("utf-8", "replace")
-
-
-def _integer(value: int | memoryview | None) -> int:
-    return value if isinstance(value, int) else 0
-
-
-def _fields(message: memoryview) -> Iterator[tuple[int, int | memoryview]]:
-    """The fields of a protobuf message: (number, integer or bytes), in the file's order.
-
-    Raises:
-        BundleError: if the bytes are not protobuf.
-    """
-    at = 0
-    while at < len(message):
-        key, at = _varint(message, at)
-        field, wire = key >> 3, key & 7
-        if wire == _VARINT:
-            number, at = _varint(message, at)
-            yield field, number
-            continue
-        if wire == _BYTES:
-            size, at = _varint(message, at)
-        elif wire in (_FIXED64, _FIXED32):
-            size = 8 if wire == _FIXED64 else 4
-        else:
-            raise BundleError("not an ONNX model: its bytes are not protobuf")
-        if at + size > len(message):
-            raise BundleError("not an ONNX model, or cut short")
-        yield field, message[at : at + size]
-        at += size
-
-
-def _varint(message: memoryview, at: int) -> tuple[int, int]:
-    """A base-128 integer and where it ends."""
-    number = 0
-    for shift in range(_LONGEST_VARINT):
-        if at >= len(message):
-            raise BundleError("not an ONNX model, or cut short")
-        byte = message[at]
-        at += 1
-        number |= (byte & 0x7F) << (7 * shift)
-        if byte < 0x80:
-            return number, at
-    raise BundleError("not an ONNX model: its bytes are not protobuf")
+def _tensor(value: onnx.ValueInfoProto) -> Tensor:
+    declared = value.type.tensor_type
+    sizes = tuple(dim.dim_value if dim.HasField("dim_value") else None for dim in declared.shape.dim)
+    return Tensor(value.name, declared.elem_type, sizes)

@@ -5,7 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+import torch
 from gymnasium.spaces import Box
+from torch import Tensor
 
 from trainer.config import Config
 from trainer.errors import ConfigError
@@ -48,11 +50,11 @@ class ActionRange:
         edge: Floats = ((np.minimum(-self.low, self.high) - self.dead) / self.unit).astype(np.float32)
         return edge
 
-    def sent(self, drawn: Floats) -> Floats:
+    def sent(self, drawn: Tensor) -> Tensor:
         """Actions within the bounds [..., a] for the policy's draws [..., a]."""
-        jump = self.dead * np.clip(drawn * np.float32(1 / RAMP), -1, 1)
-        action: Floats = np.clip(drawn * self.unit + jump, self.low, self.high)
-        return action
+        unit, dead, low, high = (torch.from_numpy(of) for of in (self.unit, self.dead, self.low, self.high))
+        jump = dead * (drawn * (1 / RAMP)).clamp(-1, 1)
+        return torch.minimum(torch.maximum(drawn * unit + jump, low), high)
 
 
 def action_range(config: Config, space: Box) -> ActionRange:

@@ -3,46 +3,54 @@
 from collections import deque
 from dataclasses import dataclass, field
 
+import torch
+
 Numbers = dict[str, float | list[float]]
 
 
-@dataclass
 class AdamMultiplier:
     """λ ≥ 0 by Adam's ascent on λ (J_c − d), as in PPO-Lagrangian [Ray 2019].
 
-    Attributes:
-        value: λ.
+    Args:
+        value: λ to start with.
         step: Adam's step size.
-        first: Adam's first moment of the gradient J_c − d.
-        second: its second moment.
-        count: steps taken.
     """
 
-    value: float
-    step: float
-    first: float = 0.0
-    second: float = 0.0
-    count: int = 0
+    def __init__(self, value: float, step: float) -> None:
+        self._value = torch.tensor(value, dtype=torch.float64)
+        self._adam = torch.optim.Adam([self._value], lr=step, maximize=True)
+        self._set(0, 0.0, 0.0)
+
+    @property
+    def value(self) -> float:
+        """The multiplier λ."""
+        return self._value.item()
 
     def update(self, episode_cost: float, limit: float) -> float:
         """One step with the mean episode cost J_c and the cost limit d; returns λ."""
-        gradient = episode_cost - limit
-        self.count += 1
-        self.first = 0.9 * self.first + 0.1 * gradient
-        self.second = 0.999 * self.second + 0.001 * gradient**2
-        first = self.first / (1 - 0.9**self.count)
-        second = self.second / (1 - 0.999**self.count)
-        self.value = max(0.0, self.value + self.step * first / (second**0.5 + 1e-8))
+        self._value.grad = torch.tensor(episode_cost - limit, dtype=torch.float64)
+        self._adam.step()
+        self._value.clamp_(min=0)
         return self.value
 
     def state(self) -> Numbers:
         """What load_state needs."""
-        return {"value": self.value, "first": self.first, "second": self.second, "count": self.count}
+        adam = self._adam.state[self._value]
+        moments = {"first": adam["exp_avg"].item(), "second": adam["exp_avg_sq"].item()}
+        return {"value": self.value, **moments, "count": int(adam["step"])}
 
     def load_state(self, state: Numbers) -> None:
         """Takes on a state."""
-        self.value, self.first, self.second = (number(state[k]) for k in ("value", "first", "second"))
-        self.count = int(number(state["count"]))
+        self._value.fill_(number(state["value"]))
+        self._set(int(number(state["count"])), number(state["first"]), number(state["second"]))
+
+    def _set(self, count: int, first: float, second: float) -> None:
+        """Adam's own state: steps taken and the two moments of the gradient."""
+        self._adam.state[self._value] = {
+            "step": torch.tensor(float(count)),
+            "exp_avg": torch.tensor(first, dtype=torch.float64),
+            "exp_avg_sq": torch.tensor(second, dtype=torch.float64),
+        }
 
 
 @dataclass

@@ -6,6 +6,7 @@ import sys
 from contextlib import closing
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any
@@ -30,7 +31,6 @@ from trainer.closed_loop import Episodes, episodes
 from trainer.errors import CheckpointError, ExportError, TrainerError
 from trainer.learner import Learner
 from trainer.networks import mlp
-from trainer.rollout import Inference
 from trainer.train import below, load_config, make_environments
 
 TOLERANCE = 1e-5
@@ -38,6 +38,8 @@ TOLERANCE = 1e-5
 CHECKED = 1000
 """Real observations on which both are compared."""
 ENVIRONMENTS = 50
+EXPORTED_BY = ("numpy", "torch", "onnx", "onnxscript", "onnxruntime", "mujoco")
+"""Packages whose versions a manifest names."""
 NO_NETWORK = 1.0
 """λ of an algorithm without a multiplier network: no state is told from another."""
 
@@ -66,6 +68,7 @@ class TrainedRun:
         learner: its networks.
         algorithm: its algorithm, which may have a multiplier network.
         steps: environment steps behind it.
+        features: the learner's, in double precision.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -86,13 +89,18 @@ class TrainedRun:
             self.learner.load_state_dict(state)
             self.algorithm.load_state(facts["algorithm"])
             self.steps = int(facts["epoch"]) * self.config.epoch_steps
+            for parameters in self.learner.parameters.values():
+                parameters.requires_grad_(False)
+            self.features = onnx_graph.exact(self.learner.features)
         except (KeyError, ValueError, IndexError, TypeError) as error:
             raise CheckpointError(f"the checkpoint in {folder} does not fit its settings: {error}") from error
 
     def actions(self, observation: Floats) -> Floats:
         """The mean action [B, a] within bounds for raw observations [B, n], by torch in double precision."""
         actor, shape = self.learner.actor.detach(), self.learner.actor_shape
-        return self.range.sent(mlp(actor[: shape.size].double(), self._inputs(observation), shape).numpy())
+        with torch.no_grad():
+            drawn = mlp(actor[: shape.size].double(), self._exact(observation), shape)
+            return np.asarray(self.range.sent(drawn).numpy())
 
     def multipliers(self, observation: Floats) -> Floats:
         """λ [B] of raw observations [B, n], likewise; a constant without a multiplier network."""
@@ -100,29 +108,33 @@ class TrainedRun:
         if network is None:
             return np.full(observation.shape[0], NO_NETWORK, np.float32)
         with torch.no_grad():
-            return np.asarray(network(self._inputs(observation)).numpy())
+            return np.asarray(network(self._exact(observation)).numpy())
 
-    def _inputs(self, observation: Floats) -> torch.Tensor:
-        return torch.from_numpy(self.learner.features(observation, np.float64))
+    def _exact(self, observation: Floats) -> torch.Tensor:
+        """The networks' inputs [B, m] in double precision."""
+        inputs: torch.Tensor = self.features(torch.from_numpy(observation).double())
+        return inputs
 
-    def policy(self) -> "Inference":
-        """The policy's mean for few observations at a time."""
-        return Inference(self.learner.actor.detach().numpy(), self.learner.actor_shape)
+    @torch.inference_mode()
+    def act(self, observation: Floats) -> Floats:
+        """The mean action [B, a] within bounds for raw observations [B, n], as the rollout computes it."""
+        learner, shape = self.learner, self.learner.actor_shape
+        drawn = mlp(learner.actor[: shape.size], learner.inputs(observation), shape)
+        return np.asarray(self.range.sent(drawn).numpy())
 
     def graphs(self) -> tuple[bytes, bytes]:
         """policy.onnx and multiplier.onnx."""
-        learner = self.learner
-        features, shape = learner.features, learner.actor_shape
-        actor = learner.actor.detach().numpy()[: shape.size]
-        policy = onnx_graph.policy_graph(actor, shape, features, self.range)
+        learner, shape = self.learner, self.learner.actor_shape
+        inputs = len(self.features.normaliser.mean)
+        actor = learner.actor[: shape.size]
+        policy = onnx_graph.Policy(actor, shape, self.features, self.range)
         network = self.algorithm.multiplier_network()
-        if network is None:
-            return policy, onnx_graph.constant_graph(len(features.normaliser.mean), NO_NETWORK)
-        xi = network.parameters.detach().numpy()
-        multiplier = onnx_graph.multiplier_graph(
-            xi, learner.critic_shape, features, network.scale, network.power
+        multiplier = (
+            onnx_graph.Constant(NO_NETWORK)
+            if network is None
+            else onnx_graph.Multiplier(partial(network, network=mlp), self.features)
         )
-        return policy, multiplier
+        return onnx_graph.graph(policy, inputs, "action"), onnx_graph.graph(multiplier, inputs, "multiplier")
 
 
 def export(config: ExportConfig) -> Manifest:
@@ -166,7 +178,7 @@ def export(config: ExportConfig) -> Manifest:
         opset=onnx_graph.OPSET,
         training={k: v for k, v in dataclasses.asdict(run.config).items() if k not in {"out", "resume"}},
         figures=_figures(played) | {"steps": float(run.steps)} | differences,
-        versions={name: version(name) for name in ("numpy", "torch", "onnx", "onnxruntime", "mujoco")},
+        versions={name: version(name) for name in EXPORTED_BY},
     )
     return write_bundle(config.bundle, policy, multiplier, manifest).manifest
 
@@ -181,13 +193,11 @@ def play(run: TrainedRun, count: int, threads: int, hold: int = 1, use: Use = Us
         hold: control steps that a decision is held for; the episodes' steps are decisions then.
         use: what for; together with the run's seed it says which layouts.
     """
-    act = run.policy()
-    features = run.learner.features
     settings = dataclasses.replace(run.config, num_envs=min(count, ENVIRONMENTS), threads=threads)
     with closing(prepare_environments(settings.algorithm, make_environments(settings), hold)) as env:
         return episodes(
             env,
-            lambda observation: run.range.sent(act(features(observation))),
+            run.act,
             seeds.rows(use, run.config.seed, count),
             run.config.episode_steps // hold,
         )

@@ -1,13 +1,17 @@
-"""What the networks see: the normalised observation, and how hazards and goal lie to the robot's way."""
+"""What the networks see: the normalised observation, and how hazards and goal lie to the robot's way.
+
+In torch, once: training computes it in single precision, and the exported graphs are traced from it. Written
+for onnxruntime, where a step costs its dispatch and a small matrix product costs next to nothing: what is
+linear is a product with a constant matrix, and reductions run over the last axis or are products.
+"""
 
 import re
-from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
+import torch
+from torch import Tensor, nn
 
-from pointgoal.lidar import TINY, nearest, places
-from pointgoal.observation import BIN_WIDTH, LIDAR_BINS, layout
+from pointgoal.observation import BIN_WIDTH, LIDAR_BINS, LIDAR_RANGE, layout
 from trainer.config import Config
 from trainer.normaliser import Normaliser
 
@@ -17,13 +21,15 @@ COASTING = 0.519
 """Decay time of the robot's speed without thrust [s], which coasts this times its velocity."""
 SHARPNESS = 12.0
 """Concentration of the map's directions: a hazard shows in those within about 1/√12 rad of its own."""
-Floats = npt.NDArray[np.float32]
-DIRECTIONS: Floats = np.arange(LIDAR_BINS, dtype=np.float32) * np.float32(BIN_WIDTH)
-"""The map's directions from the goal's, counter-clockwise [rad]."""
+TINY = 1e-6
+"""Keeps divisors from 0: a lidar's reading, a squared length [m²]."""
+_TURNED = ((1.0, 0.0, 0.0, -1.0), (0.0, 1.0, 1.0, 0.0))
+"""From (x, y) to (x, y, y, −x): times (cos, sin, cos, sin), the terms of its parts along and to the left."""
+_PARTS = ((1.0, 0.0), (1.0, 0.0), (0.0, 1.0), (0.0, 1.0))
+"""Adds up those terms."""
 
 
-@dataclass(frozen=True)
-class Surroundings:
+class Surroundings(nn.Module):
     """How near the hazards are and will be, where the goal is, and what lies on the way there.
 
     A lidar reading hardly changes over the last decimetres, which decide whether a step costs anything; what
@@ -40,91 +46,135 @@ class Surroundings:
     5. twice the unit vector to the goal (ahead, left), GAIN · exp(−its distance / 1 m), and GAIN times the
        way on which the robot would coast (along that vector, to the left of it).
 
-    Where an object is, `pointgoal.lidar.places` says. A goal out of sight has no direction and no nearness.
+    An object's distance is its reading's, its bearing within the bin the middle of what the neighbours'
+    readings leave possible: exact for an object alone. A goal out of sight has no direction and no nearness.
 
     Attributes:
-        hazards: where the hazards' readings stand in the observation.
-        goal: where the goal's readings stand.
+        lidars: where the goal's readings, then the hazards' stand in the observation.
         velocity: where the velocity ahead and to the left stands.
-        length: e-folding distance [m].
+        size: numbers that it gives.
     """
 
-    hazards: slice
-    goal: slice
-    velocity: slice
-    length: float
+    following: Tensor
+    preceding: Tensor
+    middle: Tensor
+    quarters: Tensor
+    coasting: Tensor
+    ends: Tensor
+    squares: Tensor
+    around: Tensor
+    rates: Tensor
+    counted: Tensor
+    always: Tensor
+    toward: Tensor
 
-    @property
-    def size(self) -> int:
-        """Numbers that it gives."""
-        return 4 * LIDAR_BINS + 5
+    def __init__(self, lidars: slice, velocity: slice, length: float) -> None:
+        super().__init__()
+        self.lidars = lidars
+        self.velocity = velocity
+        self.length = length
+        self.size = 4 * LIDAR_BINS + 5
+        bins = np.arange(LIDAR_BINS)
+        ring = np.roll(np.eye(LIDAR_BINS), 1, 1)
+        angles = bins * BIN_WIDTH
+        zeros, ones = np.zeros(LIDAR_BINS), np.ones(LIDAR_BINS)
+        way = GAIN * np.asarray(_PARTS)
+        constants = {
+            # Of both lidars, the reading of the next bin and of the one before.
+            "following": np.kron(np.eye(2), ring.T),
+            "preceding": np.kron(np.eye(2), ring),
+            "middle": np.tile((bins + 0.5) * BIN_WIDTH, 2),
+            "quarters": (np.pi / 2, 0, np.pi / 2, 0),
+            "coasting": COASTING * np.asarray(_TURNED),
+            # x of both segments' ends, then y, from the coasting's terms and minus the way to the goal.
+            "ends": np.insert(np.kron(_PARTS, (1, 0)), 4, (0, -1, 0, 0), 0),
+            "squares": np.tile(np.eye(2), (2, 1)),
+            # cos(a − b) = cos a cos b + sin a sin b, for every direction of the map; then the level.
+            "around": (SHARPNESS * np.cos(angles), SHARPNESS * np.sin(angles), ones),
+            "rates": np.r_[np.full(3 * LIDAR_BINS, -1 / length), ones],
+            # 0 for number 3 of an empty bin, above 0 for the rest.
+            "counted": np.kron((0, 0, 1, 0), np.eye(LIDAR_BINS)),
+            "always": np.r_[ones, ones, zeros, ones],
+            # Number 5 from (cos, sin, cos, sin), the coasting's terms and exp(−distance).
+            "toward": np.block(
+                [
+                    [np.diag((2.0, 2.0)), np.zeros((2, 3))],
+                    [np.zeros((2, 5))],
+                    [np.zeros((4, 3)), way],
+                    [np.asarray([[0, 0, GAIN, 0, 0]])],
+                ]
+            ),
+        }
+        for name, value in constants.items():
+            self.register_buffer(name, torch.from_numpy(np.asarray(value, np.float32)))
 
-    def __call__(self, observation: Floats) -> Floats:
-        """The numbers [..., size] for raw observations [..., n], of the same precision."""
-        hazards = observation[..., self.hazards]
-        x, y, distance = places(hazards)
-        ux, uy, away, seen = _goal(observation[..., self.goal])
-        coast = observation[..., self.velocity] * np.float32(COASTING)
-        cx, cy = coast[..., :1], coast[..., 1:]
-        rate, gain = np.float32(-1 / self.length), np.float32(GAIN)
-        to_goal = _from_segment(x, y, ux * away, uy * away)
-        near = np.concatenate([distance, _from_segment(x, y, cx, cy), to_goal], axis=-1)
-        near = gain * np.exp(rate * near)
-        near[..., -LIDAR_BINS:] *= hazards > 0
-        shown = self._map(*_turned(x, y, ux, uy), distance)
-        coasting = [gain * part for part in _turned(cx, cy, ux, uy)]
-        goal = 2 * ux, 2 * uy, gain * seen * np.exp(-away), *coasting
-        result: Floats = np.concatenate([near, shown, *goal], axis=-1)
-        return result
+    def forward(self, observation: Tensor) -> Tensor:
+        """The numbers [B, size] for raw observations [B, n]."""
+        lidars = observation[:, self.lidars]
+        goal, hazards = torch.split(lidars, LIDAR_BINS, 1)
+        goals, bearing = torch.split(self._bearings(lidars), LIDAR_BINS, 1)
+        heading = goals.gather(1, goal.argmax(1, keepdim=True))
+        reading = goal.amax(1, keepdim=True)
+        seen, behind = reading.sign(), (reading - 1) * LIDAR_RANGE
+        turn = torch.sin(heading + self.quarters)
+        coasting = turn * (observation[:, self.velocity] @ self.coasting)
 
-    def _map(self, along: Floats, left: Floats, distance: Floats) -> Floats:
-        """Number 4, from the hazards' places in the frame of the goal [..., bins]."""
-        ratio = np.float32(SHARPNESS) / np.maximum(distance, np.float32(TINY))
-        cosine = (ratio * along)[..., None] * np.cos(DIRECTIONS)
-        cosine = cosine + (ratio * left)[..., None] * np.sin(DIRECTIONS)
-        level = distance * np.float32(-0.5 / self.length) - np.float32(SHARPNESS)
-        shown: Floats = np.float32(GAIN) * np.exp((cosine + level[..., None]).max(-2))
-        return shown
+        # From here on in the goal's frame: ahead is where the goal is.
+        relative, distance = bearing - heading, (1 - hazards) * LIDAR_RANGE
+        direction = torch.cat([torch.cos(relative), torch.sin(relative)], 1)
+        ends = torch.cat([coasting, behind * seen], 1) @ self.ends
+        apart = self._from_segments(direction.view(-1, 2, LIDAR_BINS) * distance.unsqueeze(1), ends)
+        shown = self._map(direction * seen, distance)
+        exponent = torch.cat([distance, apart, shown], 1) * self.rates
+        counted = torch.addmm(self.always, hazards, self.counted).sign()
+        near = torch.exp(exponent) * counted * GAIN
+        to_goal = torch.cat([turn, coasting, torch.exp(behind)], 1) @ self.toward
+        return torch.cat([near, to_goal * seen], 1)
+
+    def _bearings(self, lidars: Tensor) -> Tensor:
+        """Bearing [rad] of the object in every bin of both lidars [B, 2 bins]."""
+        divisor = lidars.clamp(min=TINY)
+        upper = torch.minimum(lidars @ self.following, divisor)
+        lower = torch.minimum(lidars @ self.preceding, divisor)
+        return (upper - lower) / divisor * (BIN_WIDTH / 2) + self.middle
+
+    def _from_segments(self, place: Tensor, ends: Tensor) -> Tensor:
+        """Distances [B, 2 bins] of places [B, 2, bins] from the segments between robot and `ends` [B, 4]."""
+        square = ((ends * ends) @ self.squares).unsqueeze(2) + TINY
+        ends = ends.view(-1, 2, 2)
+        share = ((ends.transpose(1, 2) @ place) / square).clamp(0, 1)
+        apart = place.unsqueeze(2) - share.unsqueeze(1) * ends.unsqueeze(3)
+        x, y = torch.split((apart * apart).view(-1, 4 * LIDAR_BINS), 2 * LIDAR_BINS, 1)
+        return torch.sqrt(x + y)
+
+    def _map(self, direction: Tensor, distance: Tensor) -> Tensor:
+        """log(number 4 / GAIN) [B, bins] of hazards' directions [B, 2 bins] and distances [B, bins]."""
+        level = distance * (-0.5 / self.length) - SHARPNESS
+        rays = torch.cat([direction, level], 1).view(-1, 3, LIDAR_BINS)
+        return (rays.transpose(1, 2) @ self.around).amax(1)
 
 
-def _goal(reading: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-    """Of the only object: unit vector x, y (0 out of sight), distance [m], 1 in sight, else 0 [..., 1]."""
-    x, y, distance, seen = nearest(reading)
-    divisor: Floats = np.maximum(distance, np.float32(TINY))
-    return seen * x / divisor, seen * y / divisor, distance, seen
-
-
-def _turned(x: Floats, y: Floats, ux: Floats, uy: Floats) -> tuple[Floats, Floats]:
-    """Parts of (x, y) along the unit vector (ux, uy) and to the left of it."""
-    return x * ux + y * uy, y * ux - x * uy
-
-
-def _from_segment(x: Floats, y: Floats, dx: Floats, dy: Floats) -> Floats:
-    """Distance of places [..., bins] from the segment between the robot and (dx, dy) [..., 1]."""
-    share = np.clip((x * dx + y * dy) / (dx * dx + dy * dy + np.float32(TINY)), 0, 1)
-    apart: Floats = np.sqrt((x - share * dx) ** 2 + (y - share * dy) ** 2)
-    return apart
-
-
-class Features:
+class Features(nn.Module):
     """Inputs of all networks from raw observations.
 
     Attributes:
         normaliser: of the raw observation.
         surroundings: None for a task without a hazards' lidar.
+        size: numbers that it gives.
     """
 
     def __init__(self, observations: int, surroundings: Surroundings | None) -> None:
+        super().__init__()
         self.normaliser = Normaliser(observations)
         self.surroundings = surroundings
         self.size = observations + (surroundings.size if surroundings else 0)
 
-    def __call__(self, observation: npt.NDArray[np.floating], dtype: type = np.float32) -> Floats:
-        """Inputs [..., size] of raw observations [..., n], computed in the precision of `dtype`."""
-        normalised = self.normaliser(observation, dtype)
+    def forward(self, observation: Tensor) -> Tensor:
+        """Inputs [B, size] of raw observations [B, n]."""
+        normalised: Tensor = self.normaliser(observation)
         if self.surroundings is None:
             return normalised
-        return np.concatenate([normalised, self.surroundings(observation.astype(dtype))], axis=-1)
+        return torch.cat([normalised, self.surroundings(observation)], 1)
 
 
 def surroundings(config: Config) -> Surroundings | None:
@@ -133,10 +183,6 @@ def surroundings(config: Config) -> Surroundings | None:
     if match is None or config.nearness == 0:
         return None
     where = layout(int(match[1]))
+    goal, hazards = where.slice("goal_lidar"), where.slice("hazards_lidar")
     start = where.slice("velocimeter").start
-    return Surroundings(
-        where.slice("hazards_lidar"),
-        where.slice("goal_lidar"),
-        slice(start, start + 2),
-        config.nearness,
-    )
+    return Surroundings(slice(goal.start, hazards.stop), slice(start, start + 2), config.nearness)

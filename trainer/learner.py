@@ -208,7 +208,9 @@ class Learner:
 
     def inputs(self, observation: npt.NDArray[np.float32]) -> Tensor:
         """Raw observations [..., n] → the networks' inputs [B, m]."""
-        return _flat(self.features(observation))
+        with torch.no_grad():
+            result: Tensor = self.features(_flat(observation))
+        return result
 
     def state_dict(self) -> dict[str, npt.NDArray[Any]]:
         """Arrays from which load_state_dict goes on bit for bit."""
@@ -244,9 +246,11 @@ class Learner:
                 self.optimisers[name].state[parameters] = {
                     key: torch.from_numpy(state[f"adam.{name}.{key}"].copy()) for key in ADAM
                 }
-        self.features.normaliser.mean = state["normaliser.mean"].copy()
-        self.features.normaliser.variance = state["normaliser.variance"].copy()
-        self.features.normaliser.count = float(state["normaliser.count"])
+        self.features.normaliser.restore(
+            state["normaliser.mean"].copy(),
+            state["normaliser.variance"].copy(),
+            float(state["normaliser.count"]),
+        )
 
 
 def _flat(array: npt.NDArray[np.float32]) -> Tensor:

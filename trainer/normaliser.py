@@ -2,6 +2,8 @@
 
 import numpy as np
 import numpy.typing as npt
+import torch
+from torch import Tensor, nn
 
 CLIP = 5.0
 """Normalised observations are clipped to ± this."""
@@ -9,7 +11,7 @@ SMALLEST_STD = 1e-2
 """Floor of the standard deviation: sensors that never move (gravity) must not amplify their last bits."""
 
 
-class Normaliser:
+class Normaliser(nn.Module):
     """Running mean and standard deviation of every observation seen, by Chan's parallel formula.
 
     The statistics move only between epochs, so that within an epoch the policy that acts is the policy
@@ -21,10 +23,21 @@ class Normaliser:
         count: observations seen.
     """
 
+    center: Tensor
+    inverse: Tensor
+
     def __init__(self, size: int) -> None:
-        self.mean: npt.NDArray[np.float64] = np.zeros(size)
-        self.variance: npt.NDArray[np.float64] = np.ones(size)
-        self.count = 0.0
+        super().__init__()
+        self.register_buffer("center", torch.empty(size))
+        self.register_buffer("inverse", torch.empty(size))
+        self.restore(np.zeros(size), np.ones(size), 0.0)
+
+    def restore(self, mean: npt.NDArray[np.float64], variance: npt.NDArray[np.float64], count: float) -> None:
+        """Takes on statistics: mean [n], variance [n] and how many observations they are of."""
+        self.mean, self.variance, self.count = mean, variance, count
+        std = np.maximum(np.sqrt(variance), SMALLEST_STD)
+        self.center.copy_(torch.from_numpy(mean))
+        self.inverse.copy_(torch.from_numpy(1.0 / std))
 
     def update(self, observation: npt.NDArray[np.floating]) -> None:
         """Takes observations [B, n] into the statistics."""
@@ -34,21 +47,8 @@ class Normaliser:
         total = self.count + rows
         shift = mean - self.mean
         spread = self.variance * self.count + variance * rows + shift**2 * (self.count * rows / total)
-        self.mean = self.mean + shift * (rows / total)
-        self.variance = spread / total
-        self.count = total
+        self.restore(self.mean + shift * (rows / total), spread / total, total)
 
-    def scale(self) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
-        """Mean [n] and 1 / standard deviation [n] as the graphs and the rollout use them, float32."""
-        std = np.maximum(np.sqrt(self.variance), SMALLEST_STD)
-        return self.mean.astype(np.float32), (1.0 / std).astype(np.float32)
-
-    def __call__(
-        self, observation: npt.NDArray[np.floating], dtype: type = np.float32
-    ) -> npt.NDArray[np.float32]:
-        """Normalises observations [..., n] to within ±5, computed in the precision of `dtype`."""
-        mean, inverse = self.scale()
-        z: npt.NDArray[np.float32] = np.subtract(observation, mean, dtype=dtype)
-        np.multiply(z, inverse, out=z)
-        np.clip(z, -CLIP, CLIP, out=z)
-        return z
+    def forward(self, observation: Tensor) -> Tensor:
+        """Normalises observations [B, n] to within ±5."""
+        return ((observation - self.center) * self.inverse).clamp(-CLIP, CLIP)

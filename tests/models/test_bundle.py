@@ -153,6 +153,28 @@ def _external_in_a_subgraph(model: onnx.ModelProto) -> None:
     )
 
 
+def _external_in_a_function(model: onnx.ModelProto) -> None:
+    tensor = TensorProto(name="hidden", data_type=TensorProto.FLOAT, dims=[1])
+    tensor.external_data.add(key="location", value="/etc/passwd")
+    model.functions.add(name="f").node.append(helper.make_node("Constant", [], ["hidden"], value=tensor))
+
+
+def _external_in_a_sparse_tensor(model: onnx.ModelProto) -> None:
+    model.graph.sparse_initializer.add().values.data_location = TensorProto.EXTERNAL
+
+
+def _unknown_operator(model: onnx.ModelProto) -> None:
+    model.graph.node[0].op_type = "Jemm"
+
+
+def _missing_input(model: onnx.ModelProto) -> None:
+    model.graph.node[0].input[0] = "nothing"
+
+
+def _short_tensor(model: onnx.ModelProto) -> None:
+    model.graph.initializer[0].raw_data = model.graph.initializer[0].raw_data[:-4]
+
+
 @pytest.mark.parametrize(
     ("edit", "expected"),
     [
@@ -164,6 +186,11 @@ def _external_in_a_subgraph(model: onnx.ModelProto) -> None:
         (_foreign_operators, "com.example 1"),
         (_external, "external data"),
         (_external_in_a_subgraph, "external data"),
+        (_external_in_a_function, "external data"),
+        (_external_in_a_sparse_tensor, "external data"),
+        (_unknown_operator, "not a valid ONNX model: No Op registered for Jemm"),
+        (_missing_input, "not a valid ONNX model: Nodes in a graph must be topologically sorted"),
+        (_short_tensor, "not a valid ONNX model"),
     ],
 )
 def test_a_graph_of_another_shape_is_refused(

@@ -8,7 +8,8 @@ from pathlib import Path
 
 SCRIPT = """
 import sys
-for name in ("torch", "mujoco", "gymnasium", "onnx", "scipy", "matplotlib", "tensorboard", "safetensors"):
+training = "torch", "mujoco", "gymnasium", "onnxscript", "scipy", "matplotlib", "tensorboard", "safetensors"
+for name in training:
     sys.modules[name] = None  # an import of it now raises ImportError
 import server, monitor, filter, models
 from server.serve import main

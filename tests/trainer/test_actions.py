@@ -14,7 +14,7 @@ ROBOT = Box(-1, 1, (2,), np.float64)
 
 def test_the_robots_thrust_is_drawn_in_units_of_its_saturation():
     actions = action_range(Config(), ROBOT)
-    sent = actions.sent(np.float32([[0.5, 0.5], [-3, 3], [9, -9]]))
+    sent = actions.sent(torch.tensor([[0.5, 0.5], [-3, 3], [9, -9]]))
     np.testing.assert_allclose(sent, [[0.025, 0.593], [-0.05, 1], [0.05, -1]])
     np.testing.assert_allclose(actions.edge, [1, 1 - 0.093])
 
@@ -24,7 +24,7 @@ def test_what_the_policy_draws_turns_the_robot_however_small(sign):
     """The servo's dead zone is as wide as it is said to be, and the range leads out of it."""
     actions = action_range(Config(), ROBOT)
     dead = float(actions.dead[1])
-    small = actions.sent(np.float32([[0, sign * 0.02]]))[0]
+    small = actions.sent(torch.tensor([[0, sign * 0.02]]))[0]
     env = PointGoalVectorEnv(1, 3, num_threads=1)
     env.reset(seed=0)
     before = env.pose[:, 2].copy()
@@ -38,7 +38,7 @@ def test_what_the_policy_draws_turns_the_robot_however_small(sign):
 
 def test_another_task_keeps_its_bounds():
     actions = action_range(Config(task="Other-v0"), Box(-3, 2, (1,), np.float64))
-    np.testing.assert_array_equal(actions.sent(np.float32([[-9], [9], [1.5]])), [[-3], [2], [1.5]])
+    assert actions.sent(torch.tensor([[-9], [9], [1.5]])).tolist() == [[-3], [2], [1.5]]
 
 
 @pytest.mark.parametrize("useful", [(0.05,), (0.0, 1.0), (0.05, 1.5), (0.05, 0.09)])

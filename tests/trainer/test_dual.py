@@ -1,23 +1,21 @@
 import numpy as np
 import pytest
-import torch
 
 from trainer.algorithms.lagnet_foresight import next_scale
 from trainer.dual import AdamMultiplier, PidMultiplier
 
 
-def test_adam_multiplier_follows_torchs_adam():
-    costs = np.random.default_rng(0).uniform(0, 4, 60)
-    dual = AdamMultiplier(0.001, 0.035)
-    reference = torch.tensor([0.001], dtype=torch.float64, requires_grad=True)
-    adam = torch.optim.Adam([reference], lr=0.035)
-    for cost in costs:
-        adam.zero_grad()
-        (-reference * (cost - 2.0)).sum().backward()
-        adam.step()
-        with torch.no_grad():
-            reference.clamp_(min=0)
-        assert dual.update(cost, 2.0) == pytest.approx(reference.item(), abs=1e-7)
+def test_adam_multiplier_follows_adams_formula():
+    """As written in Kingma and Ba's algorithm 1, with λ held at 0 or above."""
+    dual, value, first, second = AdamMultiplier(0.001, 0.035), 0.001, 0.0, 0.0
+    for n, cost in enumerate(np.random.default_rng(0).uniform(0, 4, 60), 1):
+        gradient = cost - 2.0
+        first = 0.9 * first + 0.1 * gradient
+        second = 0.999 * second + 0.001 * gradient**2
+        step = first / (1 - 0.9**n) / ((second / (1 - 0.999**n)) ** 0.5 + 1e-8)
+        value = max(0.0, value + 0.035 * step)
+        assert dual.update(cost, 2.0) == pytest.approx(value, abs=1e-12)
+        assert dual.value == dual.state()["value"]
 
 
 def test_pid_under_a_constant_excess_has_its_closed_form():

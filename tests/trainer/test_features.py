@@ -1,6 +1,7 @@
 import numpy as np
 import onnxruntime
 import pytest
+import torch
 from gymnasium.spaces import Box
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -10,12 +11,16 @@ from pointgoal.observation import layout
 from trainer.actions import action_range
 from trainer.config import Config
 from trainer.features import COASTING, GAIN, SHARPNESS, Features, surroundings
-from trainer.networks import Shape, initial
-from trainer.onnx_graph import policy_graph
-from trainer.rollout import Inference
+from trainer.networks import Shape, initial, mlp
+from trainer.onnx_graph import Policy, exact, graph
 
 HAZARDS, GOAL = layout(1).slice("hazards_lidar"), layout(1).slice("goal_lidar")
 VELOCITY = layout(1).slice("velocimeter").start
+
+
+def seen(observation, **settings):
+    """The surroundings of one observation, in double precision."""
+    return surroundings(Config(**settings)).double()(torch.from_numpy(observation)[None])[0].numpy()
 
 
 def distance_to_segment(point, end):
@@ -31,7 +36,7 @@ def test_surroundings_belong_to_tasks_with_hazards(task, numbers):
     size = layout(int(task[9])).size
     features = Features(size, surroundings(Config(task=task)))
     assert features.size == size + numbers
-    assert features(np.zeros((2, size))).shape == (2, features.size)
+    assert features(torch.zeros((2, size))).shape == (2, features.size)
 
 
 def show(observation, lidar, distance, bearing):
@@ -60,7 +65,7 @@ def test_surroundings_of_one_hazard_and_the_goal_are_exact(hazard, goal, velocit
     b = show(observation, HAZARDS, *hazard)
     show(observation, GOAL, *goal)
     observation[VELOCITY : VELOCITY + 2] = velocity
-    given_ = surroundings(Config(nearness=0.5))(observation)
+    given_ = seen(observation, nearness=0.5)
     now, coasting, corridor, around, toward = np.split(given_, [16, 32, 48, 64])
 
     def near(distance):
@@ -88,7 +93,7 @@ def test_the_map_turns_with_the_goal():
         for distance, bearing in ((0.4, 0.3), (0.9, 2.0), (1.5, 4.4)):
             show(observation, HAZARDS, distance, bearing + turn)
         show(observation, GOAL, 1.2, 1.1 + turn)
-        return surroundings(Config())(observation)[48:64]
+        return seen(observation)[48:64]
 
     for turn in np.linspace(0, 2 * np.pi, 16, endpoint=False):  # by whole bins
         assert around(turn) == pytest.approx(around(0.0), abs=1e-3)
@@ -98,11 +103,11 @@ def test_the_map_turns_with_the_goal():
 def test_a_goal_out_of_sight_and_empty_bins_show_nothing():
     observation = np.zeros(60)
     b = show(observation, HAZARDS, 0.5, 0.1)
-    unseen = surroundings(Config())(observation)
+    unseen = seen(observation)
     assert (unseen[64:] == 0).all()
     assert (unseen[48:64] < 1e-3).all()
     show(observation, GOAL, 2.99, np.pi)
-    corridor = surroundings(Config())(observation)[32:48]
+    corridor = seen(observation)[32:48]
     assert np.flatnonzero(corridor).tolist() == sorted([b, (b + 1) % 16, (b - 1) % 16])
 
 
@@ -118,13 +123,14 @@ def test_the_onnx_graph_sees_what_the_networks_see():
     features = Features(60, surroundings(Config()))
     features.normaliser.update(observation)
     shape = Shape(features.size, 2)
-    theta = initial(shape, rng, 1.0).numpy()
+    theta = initial(shape, rng, 1.0)
     actions = action_range(Config(), Box(-1, 1, (2,)))
-    graph = policy_graph(theta, shape, features, actions)
-    session = onnxruntime.InferenceSession(graph, providers=["CPUExecutionProvider"])
+    precise = exact(features)
+    data = graph(Policy(theta, shape, precise, actions), 60, "action")
+    session = onnxruntime.InferenceSession(data, providers=["CPUExecutionProvider"])
     (computed,) = session.run(["action"], {"observation": observation})
-    exact = Inference(np.append(theta, [0, 0]).astype(np.float64), shape)
-    expected = actions.sent(exact(features(observation, np.float64)))
+    drawn = mlp(theta.double(), precise(torch.from_numpy(observation).double()), shape)
+    expected = actions.sent(drawn).numpy()
     assert np.abs(expected).min() < 0.01 < np.abs(expected).max()
     np.testing.assert_allclose(computed, expected, atol=1e-6)
 

@@ -5,7 +5,6 @@ from torch.distributions import Independent, Normal, kl_divergence
 
 from trainer import networks
 from trainer.networks import Shape, fast_mlp, initial, mlp
-from trainer.rollout import Inference
 
 SHAPE = Shape(7, 3)
 
@@ -50,11 +49,3 @@ def test_log_probability_and_divergence_agree_with_torch_distributions():
     torch.testing.assert_close(networks.log_probability(mean, log_std, action), p.log_prob(action))
     got = networks.kl_divergence(mean, log_std, other, other_std)
     torch.testing.assert_close(got, kl_divergence(p, q).mean())
-
-
-def test_the_rollouts_inference_is_the_actor():
-    rng = np.random.default_rng(3)
-    theta = torch.cat([initial(SHAPE, rng, 1.0), torch.zeros(3)])
-    x = rng.normal(size=(5, 7)).astype(np.float32) * 4
-    want = mlp(theta[: SHAPE.size], torch.from_numpy(x), SHAPE)
-    np.testing.assert_allclose(Inference(theta.numpy(), SHAPE)(x), want, atol=1e-5)

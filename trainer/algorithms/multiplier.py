@@ -9,7 +9,10 @@ from torch.nn.functional import softplus
 
 from trainer.critics import check_finite
 from trainer.learner import Learner
-from trainer.networks import fast_mlp, initial
+from trainer.networks import Shape, fast_mlp, initial
+
+Network = Callable[[Tensor, Tensor, Shape], Tensor]
+"""networks.mlp, or what computes the same."""
 
 
 class MultiplierNetwork:
@@ -32,14 +35,14 @@ class MultiplierNetwork:
         self.scale = 1.0
         self.power = 1.0
 
-    def raw(self, observation: Tensor) -> Tensor:
+    def raw(self, observation: Tensor, network: Network = fast_mlp) -> Tensor:
         """softplus(f_ξ(s)) [B] for the networks' inputs [B, m]."""
         parameters = self.parameters.to(observation.dtype)
-        return softplus(fast_mlp(parameters, observation, self._shape)[:, 0])
+        return softplus(network(parameters, observation, self._shape)[:, 0])
 
-    def __call__(self, observation: Tensor) -> Tensor:
+    def __call__(self, observation: Tensor, network: Network = fast_mlp) -> Tensor:
         """λ_ξ(s) [B] for the networks' inputs [B, m]."""
-        return self.scale * self.raw(observation) ** self.power
+        return self.scale * self.raw(observation, network) ** self.power
 
     def descend(self, schedule: list[list[slice]], loss: Callable[[slice], Tensor]) -> float:
         """Passes of minibatch descent on a loss.
