@@ -3,6 +3,7 @@
 from filter.barrier_filter import BarrierFilter
 from filter.config import FilterConfig
 from filter.errors import FilterError, FilterInputError, SolverError
+from filter.floor import floor
 from filter.scene import Scene
 from filter.step import Step
 from system.point_robot import Robot
@@ -16,4 +17,5 @@ __all__ = [
     "Scene",
     "SolverError",
     "Step",
+    "floor",
 ]

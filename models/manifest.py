@@ -54,6 +54,7 @@ class Manifest(_Strict):
         threshold: the gate `risk` activates the filter where λ is above this.
         threshold_source: how the threshold was set.
         hazard_radius: radius of a hazard [m].
+        robot: the robot's constants, name → number, as `system.Robot` names them; empty: the task's own.
         opset: version of the standard ONNX operators that both graphs use.
         sha256: file name → SHA-256 of the file, hexadecimal; `write_bundle` fills it in.
         training: the training's configuration.
@@ -74,6 +75,7 @@ class Manifest(_Strict):
     threshold: Annotated[float, Field(ge=0.0)]
     threshold_source: Annotated[str, Field(min_length=1)]
     hazard_radius: Annotated[float, Field(gt=0.0)]
+    robot: dict[str, Annotated[float, Field(gt=0.0)]] = {}
     opset: Positive
     sha256: dict[
         Literal["policy.onnx", "multiplier.onnx"], Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]

@@ -26,6 +26,8 @@ _LARGEST = float(np.finfo(np.float32).max)
 class ActionFilter(Protocol):
     """What the monitor needs of a filter; `filter.BarrierFilter` is one."""
 
+    config: FilterConfig
+
     def look(self, observation: ArrayLike, hazards: ArrayLike | None = None) -> Scene:
         """What N robots see."""
 
@@ -70,9 +72,8 @@ class Monitor:
         manifest = bundle.manifest
         self.bundle = bundle
         self.faults = Faults()
-        self.gate = Gate(
-            gate, manifest.threshold if threshold is None else float(threshold), floor(_robot(bundle))
-        )
+        wanted = manifest.threshold if threshold is None else float(threshold)
+        self.gate = Gate(gate, wanted, floor(action_filter.config))
         self._networks = networks
         self._filter = action_filter
         self._low = np.array(manifest.action_low, np.float64)
