@@ -3,9 +3,9 @@
 from filter.barrier_filter import BarrierFilter
 from filter.config import FilterConfig
 from filter.errors import FilterError, FilterInputError, SolverError
-from filter.floor import floor
 from filter.scene import Scene
 from filter.step import Step
+from filter.wrapper import SafetyFilter
 from system.point_robot import Robot
 
 __all__ = [
@@ -14,8 +14,8 @@ __all__ = [
     "FilterError",
     "FilterInputError",
     "Robot",
+    "SafetyFilter",
     "Scene",
     "SolverError",
     "Step",
-    "floor",
 ]

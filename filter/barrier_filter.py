@@ -20,9 +20,11 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
-LINEARISATIONS = (False, False, True, False)
-"""Where the QP is linearised, one after the other, until its solution is certified: about the reference, about
-that solution, about the best backup's own action (True), which is feasible, about that solution."""
+LINEARISATIONS = (0.0, 0.0, 2.0, 0.0, 0.5, 0.1, 0.02)
+"""How the QP is linearised, one after the other, until its solution is certified. 0: about the reference
+first, about the last solution afterwards. Above 0: about the best backup's own action, which is feasible, and
+the solution stays so near to it (2 leaves the whole box): a step is not smooth in the turn, whose servo
+chatters, so that a linearisation may hold nearby only."""
 _CHUNK = 512
 """Robots handled at once: bounds the memory of the obstacles."""
 
@@ -108,7 +110,7 @@ class BarrierFilter:
             refused[rows] = ~step.certify(rows, proposed, least[rows])
         left = np.flatnonzero(refused)
         if left.size:
-            step.blame(left)
+            step.blame(left, view.source[left, step.nearest(left)])
             left = self._by_qp(step, Programme(step, left, ~led[left]))
             self._fall_back(step, self._by_search(step, left))
         return step.decisions()
@@ -126,7 +128,9 @@ class BarrierFilter:
         Raises:
             FilterInputError: if an input has a wrong shape or a value that is not finite.
         """
-        view = self.look(np.asarray(observation)[None], None if hazards is None else np.asarray(hazards)[None])
+        view = self.look(
+            np.asarray(observation)[None], None if hazards is None else np.asarray(hazards)[None]
+        )
         nominal = scene.check_action(np.asarray(nominal_action)[None], 1)
         step = Step(self._settings, view, nominal, scene.check_memory(None, 1), np.ones(1, np.bool_))
         row = np.zeros(1, np.int64)
@@ -136,10 +140,10 @@ class BarrierFilter:
 
     def _by_qp(self, step: Step, programme: Programme) -> IntArray:
         """Send the QP's own solution where it is certified; the rows that are left."""
-        for planned in LINEARISATIONS:
+        for trust in LINEARISATIONS:
             if not programme.rows.size:
                 break
-            programme.linearise(planned)
+            programme.linearise(trust)
             programme.solve(self._solver)
             rows, action = programme.rows, programme.action()
             done = programme.solved & step.certify(rows, action, step.need[rows])
@@ -154,7 +158,7 @@ class BarrierFilter:
     def _by_search(self, step: Step, rows: IntArray) -> IntArray:
         """Send the certified action nearest to the reference, of those that are tried; the rows left."""
         found = step.search(rows)
-        done = step.certificates["clearance"][rows] >= step.need[rows]
+        done: BoolArray = step.certificates["clearance"][rows] >= step.need[rows]
         step.send(rows[done], found[done], Mode.FILTERED, Origin.SEARCH)
         return rows[~done]
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from filter.backups import best_backup
-from system.compiled import compiled
 from filter.config import Settings
+from system.clearance import best_backup
+from system.compiled import compiled
 from system.obstacles import FAR, least_gap
 from system.point_robot import State, advance, stopping
 
@@ -47,7 +47,7 @@ def certify(
     middle = advance(settings.robot, state, thrust, turn, half)
     after = advance(settings.robot, middle, thrust, turn, settings.robot.substeps - half)
     value, blocker, kind, steps = best_backup(
-        settings, obstacles, count, stopping(settings.robot, after), enough
+        settings, obstacles, count, stopping(settings.robot, after), enough, False
     )
     first, at_first = least_gap(obstacles, count, state.x, state.y, middle.x, middle.y, blocker, -FAR)
     second, at_second = least_gap(obstacles, count, middle.x, middle.y, after.x, after.y, blocker, -FAR)

@@ -15,24 +15,23 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from filter.config import Settings
 from system.backups import steered
 from system.compiled import compiled
-from filter.config import Settings
-from system.obstacles import gap
 from system.point_robot import State, Stopping, stopping
 
 FloatArray = NDArray[np.float64]
 
 SIDE_STEPS = 50
 """Control steps for which a side is remembered after the last refusal: 1 s."""
-_MOTION = 3.0
-"""Weight of the way to the stop point [1/m], against 1 for the thrust's direction, in the choice of a side."""
-_ON_THE_MOVE = 0.1
-"""Way ahead to the stop point from which on the end that leads is the one that moves ahead [m]."""
+_STEADY = 0.5
+"""Turn that it has to save to change the side [rad]."""
+_TURN = 1.0
+"""Turn [rad] that the side to which the policy turns, at full rate, is favoured by."""
 
 
 @compiled
-def way_past(settings: Settings, obstacle: FloatArray, side: int) -> tuple[float, float]:
+def way_past(obstacle: FloatArray, side: int) -> tuple[float, float]:
     """Unit vector from the origin past an obstacle on a side: 1 to its left, -1 to its right."""
     # Of a cone, the place on its axis that is nearest to the robot.
     x, y, dx, dy = obstacle[0], obstacle[1], obstacle[2], obstacle[3]
@@ -41,7 +40,7 @@ def way_past(settings: Settings, obstacle: FloatArray, side: int) -> tuple[float
     x += at * dx
     y += at * dy
     distance = max(math.hypot(x, y), 1e-9)
-    sine = min((obstacle[4] + at * obstacle[5] + settings.clearance) / distance, 1.0)
+    sine = min((obstacle[4] + at * obstacle[5]) / distance, 1.0)
     cosine = math.sqrt(1.0 - sine * sine)
     sine *= side
     return (cosine * x - sine * y) / distance, (sine * x + cosine * y) / distance
@@ -50,7 +49,7 @@ def way_past(settings: Settings, obstacle: FloatArray, side: int) -> tuple[float
 @compiled
 def _error(settings: Settings, obstacle: FloatArray, now: Stopping, end: float, side: int) -> float:
     """Angle from the end that leads to the way past an obstacle on a side [rad]."""
-    x, y = way_past(settings, obstacle, side)
+    x, y = way_past(obstacle, side)
     x = end * (settings.pursuit * x - now.zx)
     y = end * (settings.pursuit * y - now.zy)
     return math.atan2(y, x)
@@ -77,27 +76,10 @@ def circulate(
     left = _error(settings, obstacle, now, end, 1)
     right = _error(settings, obstacle, now, end, -1)
     # The side to which the robot has to turn less, to which the policy turns, and that was chosen before.
-    score = abs(right) - abs(left) + settings.w_steady * side
+    score = abs(right) - abs(left) + _STEADY * side
     turning = reference[1]
-    score += settings.w_turn * turning * (0.5 if left > 0.0 else -0.5)
-    score -= settings.w_turn * turning * (0.5 if right > 0.0 else -0.5)
+    score += _TURN * turning * (0.5 if left > 0.0 else -0.5)
+    score -= _TURN * turning * (0.5 if right > 0.0 else -0.5)
     side = 1 if score >= 0.0 else -1
     error = left if side > 0 else right
     return side, steered(settings.robot, settings.circulation * error)
-
-
-@compiled
-def away_of(settings: Settings, obstacles: FloatArray, i: int, state: State) -> float:
-    """The share of full thrust, 0 for none, that the stop point needs to get away from obstacle i."""
-    now = stopping(settings.robot, state)
-    here = gap(obstacles, i, now.zx, now.zy)
-    if here >= settings.off_ground:
-        return 0.0
-    step = 1e-3
-    slope = (gap(obstacles, i, now.zx + step, now.zy) - here) / step
-    if abs(slope) < 0.2:
-        return 0.0
-    robot = settings.robot
-    reach = robot.gear * robot.force_limit / robot.drag * robot.physics_step * robot.substeps
-    wanted = min((settings.off_ground - here) / (reach * abs(slope)), 1.0)
-    return wanted if slope > 0.0 else -wanted

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from system.point_robot import ROBOT, Robot
 from pointgoal.observation import HAZARD_RADIUS
+from system.point_robot import ROBOT, Robot
 
 MODEL_ERROR = 0.003
 """What the robot strays at most from the manoeuvre that was certified, from its start to its end [m]."""
@@ -46,20 +46,12 @@ class FilterConfig:
     thrust_weight: float = 4.0
     """Weight of a change of thrust in the QP, against 1 for a change of turn: prefer turning to braking."""
     circulation: float = 0.7
-    """Share of the heading's error to the way past an obstacle that the QP's circulation row asks to be turned
-    away in a control step; 0 leaves the row out."""
+    """Share of the heading's error to the way past an obstacle that the QP's circulation row turns away in a
+    control step; 0 leaves the row out."""
     pursuit: float = 0.65
     """How far along the way past an obstacle the circulation row steers the stop point to [m]."""
-    clearance: float = 0.06
-    """Distance that the way past an obstacle keeps from what the certificate asks for [m]."""
     slow: float = 0.1
     """A robot whose stop point is nearer than this hardly moves [m]."""
-    slow_thrust: float = 0.0
-    off_ground: float = 0.0
-    push: float = 0.3
-    rise: float = 0.0
-    w_steady: float = 0.5
-    w_turn: float = 1.0
     solver: str = "planar"
     """QP solver: "planar" (ours), "osqp" (kept workspace) or any that qpsolvers knows."""
     robot: Robot | None = None
@@ -74,7 +66,7 @@ class FilterConfig:
         for name in ("hazard_radius", "thrust_weight", "pursuit"):
             if getattr(self, name) is not None and not 0.0 < getattr(self, name) < 100.0:
                 raise ValueError(f"{name} must be in (0, 100), got {getattr(self, name)!r}")
-        for name in ("circulation", "slow", "clearance"):
+        for name in ("circulation", "slow"):
             if not 0.0 <= getattr(self, name) < 100.0:
                 raise ValueError(f"{name} must be in [0, 100), got {getattr(self, name)!r}")
         if not 0.0 < self.rate <= 1.0:
@@ -94,14 +86,7 @@ _NUMBERS = (
     "thrust_weight",
     "circulation",
     "pursuit",
-    "clearance",
     "slow",
-    "slow_thrust",
-    "off_ground",
-    "push",
-    "rise",
-    "w_steady",
-    "w_turn",
 )
 SETTINGS = np.dtype([("robot", ROBOT), *((name, "f8") for name in _NUMBERS)])
 """`FilterConfig`'s numbers as compiled code takes them: ``margin`` holds the position error as well, ``sure``

@@ -32,7 +32,7 @@ class Programme:
     """
 
     def __init__(self, step: Step, rows: IntArray, circulating: BoolArray) -> None:
-        self.rows = rows
+        self.rows: IntArray = rows
         self.reference = step.reference(rows)
         self.solved = np.zeros(len(rows), np.bool_)
         self.circulates = np.zeros(len(rows), np.bool_)
@@ -42,16 +42,20 @@ class Programme:
         self._x = self.reference
         self._circulating = circulating & (step.settings["circulation"][0] > 0.0)
 
-    def linearise(self, planned: bool) -> None:
-        """Build the QPs, linearised about the last solutions or, planned, about the best backups' actions."""
+    def linearise(self, trust: float) -> None:
+        """Build the QPs, linearised about the last solutions or near the best backups' actions.
+
+        Args:
+            trust: 0, or how near; see `kernel.linearise`.
+        """
         step, n = self._step, len(self.rows)
         scene = step.scene
-        most = int(scene.seen["count"][self.rows].max()) + 1
+        most = int(scene.seen["count"][self.rows].max()) + 5
         self._G, self._h = np.empty((n, most, 2)), np.empty((n, most))
         self._count = np.empty(n, np.int64)
         about = self._x.copy()
         seen = (step.settings, scene.seen, scene.obstacles, self.rows)
-        kernel.linearise(*seen, about, planned, self._G, self._h, self._count)
+        kernel.linearise(*seen, about, trust, self._G, self._h, self._count)
         side = np.sign(step.memory["side"][self.rows])
         kernel.add_circulation(*seen, self._nearest, self.reference, side, self._G, self._h, self._count)
         step.memory["side"][self.rows[self._circulating]] = side[self._circulating] * SIDE_STEPS
@@ -86,6 +90,6 @@ class Programme:
 
     def problem(self) -> Problem:
         """The first robot's QP, linearised about its reference."""
-        self.linearise(planned=False)
+        self.linearise(trust=0.0)
         rows = self._count[0] + self._circulating[0]
         return Problem(self._weights, self.reference[0], self._G[0, :rows], self._h[0, :rows])

@@ -19,10 +19,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from filter.backups import best_backup, clearances
-from system.compiled import compiled
 from filter.config import Settings
-from system.obstacles import FAR
+from system.clearance import clearances
+from system.compiled import compiled
 from system.point_robot import State, Stopping, advance, stopping
 
 FloatArray = NDArray[np.float64]
@@ -127,5 +126,5 @@ def asked(settings: Settings, clearance: float) -> float:
     It may lose a share of what it is above ``keep_off``. Below, it need not rise, for the backup's own action
     only keeps it.
     """
-    short = settings.keep_off - clearance
-    return clearance + (min(short, settings.rise) if short > 0.0 else settings.rate * short)
+    lost: float = settings.rate * max(clearance - settings.keep_off, 0.0)
+    return clearance - lost

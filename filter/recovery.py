@@ -14,10 +14,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from filter.backups import best_backup
-from system.backups import BACKUPS, law, steered
-from system.compiled import compiled
 from filter.config import Settings
+from system.backups import BACKUPS, law, steered
+from system.clearance import best_backup
+from system.compiled import compiled
 from system.obstacles import FAR, gap, least_gap
 from system.point_robot import State, Stopping, advance, follow, stopping
 
@@ -137,7 +137,7 @@ def commit(
             turn = (candidate - BACKUPS) % 3 - 1.0
         middle = advance(robot, state, thrust, turn, half)
         after = advance(robot, middle, thrust, turn, robot.substeps - half)
-        value, _, kind, thrusts = best_backup(settings, obstacles, count, stopping(robot, after), FAR)
+        value, _, kind, thrusts = best_backup(settings, obstacles, count, stopping(robot, after), FAR, False)
         if kept and value <= most:
             continue
         way, _ = least_gap(obstacles, count, state.x, state.y, middle.x, middle.y, -1, -FAR)

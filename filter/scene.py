@@ -1,4 +1,4 @@
-"""What the filter is given, checked, and what it makes of it: the robots' motion and the obstacles near them."""
+"""What the filter is given, checked, and what it makes of it: robots in motion and what is near them."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 from decision import MEMORY, Memory
 from filter.errors import FilterInputError
 from filter.kernel import SEEN, see
+from pointgoal.observation import ObservationLayout, layout
 from system.lidar import CONES
 from system.obstacles import COLUMNS
-from pointgoal.observation import ObservationLayout, layout
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -71,6 +71,11 @@ class Scene:
     def barrier(self) -> FloatArray:
         """(N,) clearance [m] beyond the margin that the best backup keeps; at most the lidar's range."""
         return np.asarray(self.seen["now"]["clearance"])
+
+    @property
+    def low(self) -> BoolArray:
+        """(N,) whether the barrier is so low that some action may lead below 0: below the floor."""
+        return np.asarray(self.seen["sure"]["clearance"] < 0.0)
 
 
 def look(settings: NDArray[np.void], observation: FloatArray, given: FloatArray | None) -> Scene:

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from system.compiled import SOURCES, compiled, entry
 from filter.errors import SolverError
 from filter.qp import Problem
+from system.compiled import compiled, entry
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -125,29 +126,19 @@ def solve_planar(
     return True
 
 
-def _solve_entry() -> Callable[..., None]:
-    sources = SOURCES
-
-    @entry
-    def solve_all(
-        weights: FloatArray,
-        reference: FloatArray,
-        G: FloatArray,
-        h: FloatArray,
-        rows: NDArray[np.int64],
-        x: FloatArray,
-        solved: NDArray[np.bool_],
-    ) -> None:
-        """Solve N problems: (N, 2), (N, M, 2), (N, M), (N,) -> (N, 2), (N,)."""
-        if not sources:
-            return
-        for k in range(rows.size):
-            solved[k] = solve_planar(weights, reference[k], G[k], h[k], rows[k], x[k])
-
-    return solve_all
-
-
-_solve_all = _solve_entry()
+@entry
+def _solve_all(
+    weights: FloatArray,
+    reference: FloatArray,
+    G: FloatArray,
+    h: FloatArray,
+    rows: NDArray[np.int64],
+    x: FloatArray,
+    solved: NDArray[np.bool_],
+) -> None:
+    """Solve N problems: (N, 2), (N, M, 2), (N, M), (N,) -> (N, 2), (N,)."""
+    for k in range(rows.size):
+        solved[k] = solve_planar(weights, reference[k], G[k], h[k], rows[k], x[k])
 
 
 def planar(problem: Problem) -> FloatArray | None:
@@ -168,7 +159,8 @@ class KeptOSQP:
 
     def __init__(self, eps: float = 1e-8) -> None:
         self._eps = eps
-        self._workspaces: dict[tuple[int, float, float], Any] = {}
+        # A workspace is written to and solved in two calls: threads must not share one.
+        self._own = threading.local()
 
     def __call__(self, problem: Problem) -> FloatArray | None:
         """Solve one problem.
@@ -211,7 +203,8 @@ class KeptOSQP:
         from scipy import sparse
 
         key = (size, float(weights[0]), float(weights[1]))
-        if key not in self._workspaces:
+        workspaces: dict[Any, Any] = self._own.__dict__.setdefault("workspaces", {})
+        if key not in workspaces:
             rows = np.tile(np.arange(size + 2), 2)
             columns = np.repeat([0, 1], size + 2)
             A = sparse.csc_matrix((np.ones(2 * size + 4), (rows, columns)), shape=(size + 2, 2))
@@ -228,8 +221,8 @@ class KeptOSQP:
                 max_iter=20_000,
                 verbose=False,
             )
-            self._workspaces[key] = workspace
-        return self._workspaces[key]
+            workspaces[key] = workspace
+        return workspaces[key]
 
 
 class ByQpsolvers:

@@ -43,8 +43,8 @@ class Step:
         self.nominal = nominal
         self.action = nominal.copy()
         self.active = active
-        # Where the gate is closed: what the best backup from here keeps.
-        self.certificates = scene.seen["now"].copy()
+        # Where the gate is closed, that is a plan whatever the nominal action is.
+        self.certificates = scene.seen["sure"].copy()
         self.certified = np.zeros(n, np.bool_)
         self.memory = memory.copy()
         self.memory["side"] -= np.sign(memory["side"])
@@ -71,7 +71,7 @@ class Step:
 
     def nearest(self, rows: IntArray) -> IntArray:
         """The obstacles (n,) that bound some rows' last certificates; 0 where there is none."""
-        return np.maximum(self.certificates["nearest"][rows], 0)
+        return np.asarray(np.maximum(self.certificates["nearest"][rows], 0))
 
     def search(self, rows: IntArray) -> FloatArray:
         """Look on a grid for the certified actions (n, 2) nearest to some rows'; see `kernel.search`."""
@@ -83,7 +83,7 @@ class Step:
         return found
 
     def recover(self, rows: IntArray) -> tuple[FloatArray, NDArray[np.int8]]:
-        """The actions (n, 2) that leave the most clearance or lead out, and what they are (n,), see `kernel`."""
+        """Actions (n, 2) that leave the most clearance or lead out, and what they are (n,): see `kernel`."""
         scene, found = self.scene, np.empty((len(rows), 2))
         outcome = np.empty(len(rows), np.int8)
         radius = self.settings["hazard_radius"][0]
@@ -120,11 +120,7 @@ class Step:
         for k in rows if reason is not None else ():
             self._reason[k] = reason
 
-    def blame(self, rows: IntArray) -> None:
-        """Name the hazards that bound some rows' last certificates as what the interventions come from."""
-        self._hazard[rows] = self.scene.source[rows, self.nearest(rows)]
-
-    def name_hazard(self, rows: IntArray, hazard: IntArray) -> None:
+    def blame(self, rows: IntArray, hazard: IntArray) -> None:
         """Name the hazards (n,) that some rows' interventions come from, -1 for none."""
         self._hazard[rows] = hazard
 

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +13,8 @@ from filter import FilterConfig, Step
 from filter.circulation import SIDE_STEPS
 from filter.config import settings
 from guide.path import Path, drives_round, shortest_path, steer
-from system.compiled import SOURCES, compiled, entry
+from pointgoal.observation import LIDAR_BINS
+from system.compiled import compiled, entry
 from system.lidar import decode_goal, likeliest, unexplained
 from system.point_robot import ROBOT, State, stopping
 
@@ -50,10 +50,9 @@ class GuideConfig:
     """How strongly the way round leads away from a hazard that is nearer than ``clearance``."""
     steadiness: float = 0.5
     """Length by which the other way round must be shorter before the robot changes its mind [m]."""
-    hold: float = 100
-    engage: float = 0.1
-    slow: float = 0.1
-    """A robot whose stop point is nearer than this [m] and whose nominal action is refused is led on."""
+    slow: float = 0.15
+    """A robot whose stop point is nearer than this hardly moves [m]: from a refusal on, it is led; one that
+    moves is the filter's first. It is also led where nothing is in its way and it is refused all the same."""
 
     def __post_init__(self) -> None:
         """Refuse settings that lead nowhere."""
@@ -61,7 +60,7 @@ class GuideConfig:
             if not 0.0 < getattr(self, name) < 100.0:
                 raise ValueError(f"{name} must be in (0, 100), got {getattr(self, name)!r}")
         for name in ("repulsion", "steadiness", "slow"):
-            if not 0.0 <= getattr(self, name) < 200.0:
+            if not 0.0 <= getattr(self, name) < 100.0:
                 raise ValueError(f"{name} must be in [0, 100), got {getattr(self, name)!r}")
 
 
@@ -69,6 +68,21 @@ _OWN = tuple(GuideConfig.__dataclass_fields__)
 _OF_FILTER = ("margin", "position_error", "bearing_error", "hazard_radius")
 GUIDE = np.dtype([("robot", ROBOT), *((name, "f8") for name in (*_OF_FILTER, *_OWN))])
 """The numbers of a guide as compiled code takes them."""
+
+
+LED = np.dtype(
+    [
+        ("action", "f8", (2,)),
+        ("refused", "?"),
+        ("engaged", "?"),
+        ("leads", "?"),
+        ("side", "i1"),
+        ("hazard", "i8"),
+    ]
+)
+"""One robot that may be led: its nominal action u1, u2, or the reference in its place; whether the nominal
+one has no certificate; whether the robot is being led past something; whether it is led in this step; the
+side on which it passes what is in its way; the hazard, or n + the bin, that is in the way, -1 for none."""
 
 
 class Guide:
@@ -102,33 +116,30 @@ class Guide:
 
     def propose(self, step: Step) -> tuple[IntArray, FloatArray]:
         """The rows (n,) of the robots that are led, and the references (n, 2) in place of their actions."""
-        memory = step.memory
-        refused = step.active & ~step.certified
+        scene, memory = step.scene, step.memory
+        engaged = memory["guided"] > 0
         wanted = step.active
-        if self.strength == "off":
-            wanted = np.zeros_like(refused)
-        elif self.strength == "refusal":
-            wanted = refused | (step.active & (memory["guided"] > 0))
+        if self.strength != "ahead":
+            wanted = step.active & (~step.certified | engaged) & (self.strength == "refusal")
         rows = np.flatnonzero(wanted)
-        scene = step.scene
         memory["guided"][~wanted] = 0
         if not rows.size:
             return rows, np.empty((0, 2))
-        leads = np.zeros(len(rows), np.bool_)
-        engaged = np.zeros(len(rows), np.bool_)
-        proposed = step.nominal[rows]
-        blamed = np.empty(len(rows), np.int64)
-        side = memory["side"][rows]
-        lead(self._settings, scene.seen, scene.given, scene.readings, scene.goal, rows, refused, proposed, side, (memory['guided'][rows]==0)&(self.strength=='refusal'), blamed, leads, engaged)
-        memory["side"][rows] = side
-        memory["guided"][rows] = engaged
-        led = rows[leads]
-        step.name_hazard(led, blamed[leads])
-        return led, proposed[leads]
+        led = np.empty(len(rows), LED)
+        led["action"] = step.nominal[rows]
+        led["refused"] = ~step.certified[rows]
+        led["engaged"] = engaged[rows] | (self.strength == "ahead")
+        led["side"] = memory["side"][rows]
+        lead(self._settings, scene.seen, scene.given, scene.readings, scene.goal, rows, led)
+        memory["side"][rows] = led["side"]
+        memory["guided"][rows] = led["engaged"]
+        led, rows = led[led["leads"]], rows[led["leads"]]
+        step.blame(rows, led["hazard"])
+        return rows, led["action"]
 
 
 @compiled
-def _discs(config: Records, given: FloatArray, readings: FloatArray, out: FloatArray, source: IntArray) -> int:
+def _discs(config: Any, given: FloatArray, readings: FloatArray, out: FloatArray, source: IntArray) -> int:
     """What to drive round: discs (x, y, radius) with the margin and a clearance; how many there are."""
     grown = config.hazard_radius + config.margin + config.clearance
     count = 0
@@ -149,91 +160,64 @@ def _discs(config: Records, given: FloatArray, readings: FloatArray, out: FloatA
 
 @compiled
 def _way(
-    config: Records,
-    discs: FloatArray,
-    count: int,
-    goal: tuple[bool, float, float],
-    state: State,
-    nominal: FloatArray,
-    refused: bool,
-    side: int,
-    fresh: bool,
-) -> tuple[bool, bool, Path]:
-    """Whether to lead a robot, and the way.
+    config: Any, discs: FloatArray, count: int, goal: tuple[bool, float, float], state: State, one: Any
+) -> Path:
+    """The way of one robot, and in ``one``, a row of `LED`, whether it is led along it.
 
     It is led while a hazard stands in the straight way to the goal and the nominal action does not drive
     round it by itself, and also where the robot hardly moves and the nominal action is refused: such a robot
-    would stay there.
+    would stay there. Whoever moves when the first action is refused is the filter's.
     """
     seen, goal_x, goal_y = goal
     now = stopping(config.robot, state)
+    side = 1 if one.side > 0 else (-1 if one.side < 0 else 0)
     way = shortest_path(discs, count, (goal_x, goal_y), (now.zx, now.zy), side, config.steadiness)
-    if not seen:
-        return False, False, way
-    if way.blocker >= 0 and way.distance < config.lookahead:
-        if fresh and math.hypot(now.zx, now.zy) > config.engage:
-            return False, False, way
-        return refused or not drives_round(config, discs, count, state, nominal, way), True, way
-    leads = refused and math.hypot(now.zx, now.zy) < config.slow
-    return leads, leads, way
+    hardly = math.hypot(now.zx, now.zy) < config.slow
+    blocked = seen and way.blocker >= 0 and way.distance < config.lookahead
+    one.engaged = blocked and (one.engaged or hardly)
+    if blocked:
+        one.leads = one.engaged and (
+            one.refused or not drives_round(config, discs, count, state, one.action, way)
+        )
+    else:
+        one.leads = seen and one.refused and hardly
+    return way
 
 
-def _lead_entry() -> Callable[..., None]:
-    sources = SOURCES
+@entry
+def lead(
+    settings: Records,
+    seen: Records,
+    given: FloatArray,
+    readings: FloatArray,
+    goals: FloatArray,
+    rows: IntArray,
+    led: Records,
+) -> None:
+    """Find the references of those robots that are led.
 
-    @entry
-    def lead(
-        settings: Records,
-        seen: Records,
-        given: FloatArray,
-        readings: FloatArray,
-        goals: FloatArray,
-        rows: IntArray,
-        refused: NDArray[np.bool_],
-        proposed: FloatArray,
-        side: NDArray[np.int8],
-        fresh: NDArray[np.bool_],
-        blamed: IntArray,
-        leads: NDArray[np.bool_],
-        engaged: NDArray[np.bool_],
-    ) -> None:
-        """Find the references of those robots that are to be led.
-
-        Args:
-            settings: (1,) of `GUIDE`.
-            seen: (N,) of `filter.kernel.SEEN`.
-            given: (N, n, 2) hazards [m].
-            readings: (N, 16) the hazards' lidar, or (N, 0).
-            goals: (N, 16) the goal's lidar.
-            rows: (n,) which robots.
-            refused: (N,) whether the nominal action has no certificate.
-            proposed: (n, 2) the nominal actions u1, u2; overwritten where it leads.
-            side: (n,) the remembered side, overwritten by the new one.
-            blamed: (n,) receives the hazard, or n + the bin, that is in the way; -1 for none.
-            leads: (n,) receives whether it leads.
-        """
-        if not sources:
-            return
-        config = settings[0]
-        size = given.shape[1] + 16
-        discs, source = np.empty((size, 3)), np.empty(size, dtype=np.int64)
-        for j in range(len(rows)):
-            k = rows[j]
-            state = State(0.0, 0.0, 0.0, seen[k].vx, seen[k].vy, seen[k].yaw_rate)
-            count = _discs(config, given[k], readings[k], discs, source)
-            before = 1 if side[j] > 0 else (-1 if side[j] < 0 else 0)
-            leads[j], engaged[j], way = _way(
-                config, discs, count, decode_goal(goals[k]), state, proposed[j], refused[k], before, fresh[j]
-            )
-            blamed[j] = source[way.blocker] if way.blocker >= 0 else -1
-            if way.side != 0:
-                side[j] = way.side * SIDE_STEPS
-            if leads[j]:
-                thrust, turn = steer(config, discs, count, state, way.x, way.y)
-                proposed[j, 0] = thrust * config.robot.force_limit
-                proposed[j, 1] = turn
-
-    return lead
-
-
-lead = _lead_entry()
+    Args:
+        settings: (1,) of `GUIDE`.
+        seen: (N,) of `filter.kernel.SEEN`.
+        given: (N, n, 2) hazards [m].
+        readings: (N, 16) the hazards' lidar, or (N, 0).
+        goals: (N, 16) the goal's lidar.
+        rows: (n,) which robots may be led.
+        led: (n,) of `LED`, overwritten.
+    """
+    config = settings[0]
+    size = given.shape[1] + LIDAR_BINS
+    discs, source = np.empty((size, 3)), np.empty(size, dtype=np.int64)
+    for j in range(len(rows)):
+        k = rows[j]
+        one = led[j]
+        state = State(0.0, 0.0, 0.0, seen[k].vx, seen[k].vy, seen[k].yaw_rate)
+        count = _discs(config, given[k], readings[k], discs, source)
+        way = _way(config, discs, count, decode_goal(goals[k]), state, one)
+        one.hazard = source[way.blocker] if way.blocker >= 0 else -1
+        if way.side != 0:
+            one.side = way.side * SIDE_STEPS
+        if one.leads:
+            thrust, turn = steer(config, discs, count, state, way.x, way.y)
+            one.action[0] = thrust * config.robot.force_limit
+            one.action[1] = turn

@@ -75,7 +75,7 @@ class Manifest(_Strict):
     threshold: Annotated[float, Field(ge=0.0)]
     threshold_source: Annotated[str, Field(min_length=1)]
     hazard_radius: Annotated[float, Field(gt=0.0)]
-    robot: dict[str, Annotated[float, Field(gt=0.0)]] = {}
+    robot: dict[str, Annotated[int | float, Field(gt=0)]] = {}
     opset: Positive
     sha256: dict[
         Literal["policy.onnx", "multiplier.onnx"], Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]

@@ -13,6 +13,7 @@ from decision import OpenedBy
 from monitor.errors import MonitorError
 
 FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
 
 GateName = Literal["risk", "always", "off"]
 """When the filter is active: where the risk score or the barrier asks for it, always, never."""
@@ -24,10 +25,9 @@ class Gate:
     """Opens early where the risk score is high, and at the latest where the barrier is low.
 
     Attributes:
-        name: `risk` opens where risk > threshold, and where the barrier is below the floor, whatever the risk
-            says; `always` and `off` look at neither.
+        name: `risk` opens where risk > threshold, and where the barrier is so low that some action might lead
+            below 0, whatever the risk says; `always` and `off` look at neither.
         threshold: finite and at least 0.
-        floor: the barrier [m] from which no single nominal action can lead below 0, see `filter.floor`.
 
     Raises:
         MonitorError: for an unknown name or a threshold that is none.
@@ -35,7 +35,6 @@ class Gate:
 
     name: GateName
     threshold: float
-    floor: float
 
     def __post_init__(self) -> None:
         """Refuse what is no gate."""
@@ -44,14 +43,14 @@ class Gate:
         if not (math.isfinite(self.threshold) and self.threshold >= 0.0):
             raise MonitorError(f"threshold must be finite and at least 0, got {self.threshold}")
 
-    def opened_by(self, risk: FloatArray, barrier: FloatArray) -> NDArray[np.str_]:
+    def opened_by(self, risk: FloatArray, low: BoolArray) -> NDArray[np.str_]:
         """What opens the gate for N robots: texts of `OpenedBy`, "" where it stays closed.
 
         Args:
             risk: (N,) the risk score; NaN opens the gate.
-            barrier: (N,) [m]; NaN opens the gate.
+            low: (N,) whether the barrier is below its floor, see `filter.Scene.low`.
         """
         if self.name != "risk":
             return np.full(len(risk), OpenedBy.ALWAYS if self.name == "always" else "", dtype="<U7")
-        by_risk, by_barrier = ~(risk <= self.threshold), ~(barrier >= self.floor)
-        return np.where(by_risk, OpenedBy.RISK, np.where(by_barrier, OpenedBy.BARRIER, ""))
+        by_risk = ~(risk <= self.threshold)
+        return np.where(by_risk, OpenedBy.RISK, np.where(low, OpenedBy.BARRIER, ""))

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from decision import MEMORY, SAFE_ACTION, Decision, Decisions, Memory, Mode, OpenedBy, Origin, next_of_plan
-from filter import BarrierFilter, FilterConfig, FilterInputError, Robot, Scene, floor
+from filter import BarrierFilter, FilterConfig, FilterInputError, Robot, Scene
 from guide import DEFAULT_STRENGTH, Guide, Strength
 from models import Bundle
 from monitor.errors import MonitorError, NetworkError
@@ -25,8 +25,6 @@ _LARGEST = float(np.finfo(np.float32).max)
 
 class ActionFilter(Protocol):
     """What the monitor needs of a filter; `filter.BarrierFilter` is one."""
-
-    config: FilterConfig
 
     def look(self, observation: ArrayLike, hazards: ArrayLike | None = None) -> Scene:
         """What N robots see."""
@@ -73,7 +71,7 @@ class Monitor:
         self.bundle = bundle
         self.faults = Faults()
         wanted = manifest.threshold if threshold is None else float(threshold)
-        self.gate = Gate(gate, wanted, floor(action_filter.config))
+        self.gate = Gate(gate, wanted)
         self._networks = networks
         self._filter = action_filter
         self._low = np.array(manifest.action_low, np.float64)
@@ -195,7 +193,7 @@ class Monitor:
         nominal, risk = self._networks.run(observation)
         nominal, sound = self._bound(nominal)
         sound &= (risk >= 0.0) & (risk < np.inf)
-        opened_by = self.gate.opened_by(risk, scene.barrier)
+        opened_by = self.gate.opened_by(risk, scene.low)
         asked = nominal
         if not sound.all():
             opened_by[~sound] = OpenedBy.FAULT
@@ -231,7 +229,7 @@ class Monitor:
         onnxruntime's tanh, for one, reaches 1.0000001.
         """
         clipped = np.minimum(np.maximum(action, self._low), self._high)
-        sound: NDArray[np.bool_] = (np.abs(action - clipped) <= _ROUNDING).all(axis=1)
+        sound: NDArray[np.bool_] = np.asarray((np.abs(action - clipped) <= _ROUNDING).all(axis=1))
         return np.where(sound[:, None], clipped, action), sound
 
     def _check_observation(self, observation: FloatArray) -> None:
@@ -312,8 +310,9 @@ class Monitor:
 
 def _robot(bundle: Bundle) -> Robot:
     """The constants of the bundle's robot; the task's own where the manifest has none."""
+    constants: dict[str, Any] = dict(bundle.manifest.robot)
     try:
-        return Robot(**bundle.manifest.robot)
+        return Robot(**constants)
     except TypeError as error:
         raise MonitorError(f"{bundle.path}: its robot: {error}") from error
 

@@ -33,7 +33,7 @@ def steered(robot: Robot, error: float) -> float:
 
 
 @compiled
-def law(robot: RobotConstants, kind: int, at: Stopping) -> tuple[float, float]:
+def law(robot: Robot, kind: int, at: Stopping) -> tuple[float, float]:
     """The control of a backup.
 
     Args:

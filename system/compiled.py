@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+import os
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -10,6 +12,9 @@ from typing import Any, TypeVar, cast
 import numba
 
 Function = TypeVar("Function", bound=Callable[..., Any])
+
+_ROOMS = ("decision", "system", "filter", "guide")
+"""The rooms that hold compiled code, and what goes into it."""
 
 
 def compiled(function: Function) -> Function:
@@ -20,14 +25,18 @@ def compiled(function: Function) -> Function:
 def entry(function: Function) -> Function:
     """Compile a function that Python calls, and keep the machine code on disk between processes.
 
-    numba compares the kept code with the entry's own file alone, not with the files of the helpers in it. An
-    entry therefore has to hold `SOURCES` as a closure variable, which numba does compare.
+    numba compares kept code with the entry's own file alone, not with the files of the helpers in it: so the
+    folder that it is kept in is named after all of them. Without a folder to write to, nothing is kept.
     """
-    return cast(Function, numba.njit(error_model="numpy", nogil=True, cache=True)(function))
-
-
-_ROOMS = ("decision", "system", "filter", "guide")
-"""The rooms that hold compiled code, and what goes into it."""
+    if _FOLDER is None:
+        return cast(Function, numba.njit(error_model="numpy", nogil=True)(function))
+    settings: Any = numba.config
+    before = settings.CACHE_DIR
+    settings.CACHE_DIR = str(_FOLDER)
+    try:
+        return cast(Function, numba.njit(error_model="numpy", nogil=True, cache=True)(function))
+    finally:
+        settings.CACHE_DIR = before
 
 
 def _digest() -> str:
@@ -36,8 +45,25 @@ def _digest() -> str:
     for room in _ROOMS:
         for path in sorted((Path(__file__).parents[1] / room).glob("*.py")):
             digest.update(path.read_bytes())
-    return digest.hexdigest()
+    return digest.hexdigest()[:16]
 
 
-SOURCES = _digest()
-"""Changes with every change to compiled code."""
+def _folder() -> Path | None:
+    """Where machine code is kept: beside the source, else in the user's own part of the temporary folder."""
+    places = [Path(__file__).parent / "__pycache__"]
+    if hasattr(os, "getuid"):
+        places.append(Path(tempfile.gettempdir()) / f"lagnet-{os.getuid()}")
+    for place in places:
+        folder = place / _digest()
+        try:
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            # What somebody else could write there would run here.
+            owned = not hasattr(os, "getuid") or folder.parent.stat().st_uid in (0, os.getuid())
+            if owned and os.access(folder, os.W_OK):
+                return folder
+        except OSError:
+            continue
+    return None
+
+
+_FOLDER = _folder()

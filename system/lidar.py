@@ -18,9 +18,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from pointgoal.observation import BIN_WIDTH, LIDAR_BINS, LIDAR_RANGE
 from system.compiled import compiled
 from system.obstacles import FloatArray, gap
-from pointgoal.observation import BIN_WIDTH, LIDAR_BINS, LIDAR_RANGE
 
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
