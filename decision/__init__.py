@@ -4,7 +4,7 @@ Every room speaks these types: the filter fills them, the monitor adds the risk 
 service sends one row of them, its client gives that row back, and the evaluation counts them.
 """
 
-from decision.decision import SAFE_ACTION, Decision, Decisions, Mode, OpenedBy, Origin
+from decision.decision import SAFE_ACTION, Decision, Decisions, Mode, OpenedBy, Origin, texts, unknown
 from decision.memory import MEMORY, PLAN_STEPS, Memory, memory_from_json, memory_to_json, next_of_plan
 
 __all__ = [
@@ -20,4 +20,6 @@ __all__ = [
     "memory_from_json",
     "memory_to_json",
     "next_of_plan",
+    "texts",
+    "unknown",
 ]
