@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from filter import FilterConfig, Step
-from filter.circulation import SIDE_STEPS
 from filter.config import settings
 from guide.path import Path, drives_round, shortest_path, steer
 from pointgoal.observation import LIDAR_BINS
@@ -116,7 +115,6 @@ class Guide:
             step.active,
             step.certified,
             ahead,
-            memory["side"],
             memory["guided"],
             proposed,
             leads,
@@ -186,7 +184,6 @@ def lead(
     active: NDArray[np.bool_],
     certified: NDArray[np.bool_],
     ahead: bool,
-    side: NDArray[np.int8],
     guided: NDArray[np.int8],
     proposed: FloatArray,
     leads: NDArray[np.bool_],
@@ -203,8 +200,7 @@ def lead(
         active: (N,) who may be led.
         certified: (N,) whose nominal action has a certificate.
         ahead: whether to lead whoever has something in the way, refused or not.
-        side: (N,) the remembered side, overwritten by the new one.
-        guided: (N,) whether a robot is being led past something, overwritten likewise.
+        guided: (N,) the side on which a robot is being led past something, 0 for none, overwritten.
         proposed: (N, 2) the nominal actions u1, u2; overwritten where it leads.
         leads: (N,) receives whether it leads.
         hazard: (N,) receives the hazard, or n + the bin, that is in the way; -1 for none.
@@ -214,20 +210,18 @@ def lead(
     size = given.shape[1] + LIDAR_BINS
     discs, source = np.empty((size, 3)), np.empty(size, dtype=np.int64)
     for k in range(len(seen)):
-        if not (active[k] and (ahead or guided[k] > 0 or not certified[k])):
+        if not (active[k] and (ahead or guided[k] != 0 or not certified[k])):
             guided[k] = 0
             continue
         state = State(0.0, 0.0, 0.0, seen[k].vx, seen[k].vy, seen[k].yaw_rate)
         count = _discs(config, given[k], observation[k, first:last], discs, source)
         at = decode_goal(observation[k, goal : goal + LIDAR_BINS])
-        before = (side[k] > 0) - (side[k] < 0)
+        engaged = ahead or guided[k] != 0
         leads[k], led, way = _leads(
-            config, discs, count, at, state, proposed[k], not certified[k], ahead or guided[k] > 0, before
+            config, discs, count, at, state, proposed[k], not certified[k], engaged, guided[k]
         )
-        guided[k] = led
+        guided[k] = way.side if led else 0
         hazard[k] = source[way.blocker] if way.blocker >= 0 else -1
-        if way.side != 0:
-            side[k] = way.side * SIDE_STEPS
         if leads[k]:
             thrust, turn = steer(config, discs, count, state, way.x, way.y)
             proposed[k, 0] = thrust * config.robot.force_limit
