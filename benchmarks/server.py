@@ -29,7 +29,7 @@ from rich.table import Table
 
 from evaluation.service import Service
 from models import Bundle
-from monitor import Gate
+from monitor import GateName
 from pointgoal.observation import layout
 from server.serve import listen
 
@@ -46,7 +46,7 @@ class ServerBenchmark:
 
     bundle: Annotated[Path, tyro.conf.Positional]
     """The bundle's folder."""
-    gate: Gate = "always"
+    gate: GateName = "always"
     """When the filter is active."""
     requests: int = 2000
     """Requests a round and connection."""

@@ -5,6 +5,8 @@ service sends one row of them, its client gives that row back, and the evaluatio
 """
 
 from decision.decision import SAFE_ACTION, Decision, Decisions, Mode, OpenedBy, Origin
+from decision.fallback import fall_back
+from decision.faults import Faults
 from decision.memory import MEMORY, PLAN_STEPS, Memory, memory_from_json, memory_to_json, next_of_plan
 
 __all__ = [
@@ -13,10 +15,12 @@ __all__ = [
     "SAFE_ACTION",
     "Decision",
     "Decisions",
+    "Faults",
     "Memory",
     "Mode",
     "OpenedBy",
     "Origin",
+    "fall_back",
     "memory_from_json",
     "memory_to_json",
     "next_of_plan",

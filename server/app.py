@@ -11,12 +11,15 @@ from fastapi.responses import JSONResponse
 from pydantic import ValidationError
 from starlette.types import ASGIApp
 
-from monitor import Monitor, memory_from_json
+from decision import Memory, memory_from_json
+from monitor import Monitor
 from server.guard import BodyTooLargeError, Guard
-from server.schema import ActReply, ActRequest, ModelReply
+from server.schema import ActReply, ActRequest, MemoryJson, ModelReply, reply_of
 
 MAX_BODY = 65536
 """Most bytes of a request's body: 60 numbers and a thousand hazards fit."""
+MANY_FAULTS = 5
+"""Internal faults within a minute from which on the service is not ready: a robot may live with one."""
 _MAX_ERRORS = 8
 
 
@@ -58,6 +61,7 @@ def create_app(
         responses={
             413: {"description": "body too large"},
             422: {"description": "names the field that is wrong"},
+            500: {"description": "the decision could not be told"},
         },
         openapi_extra={
             "requestBody": {"required": True, "content": {"application/json": {"schema": _act_schema(model)}}}
@@ -75,12 +79,10 @@ def create_app(
             message = f"must have {model.observation_size} numbers, got {len(asked.observation)}"
             return _unprocessable([(["observation"], message, "wrong_length")])
         try:
-            memory = memory_from_json(asked.memory)
+            memory = _memory(asked.memory)
         except ValueError as error:
             return _unprocessable([(["memory"], str(error), "wrong_memory")])
-        decision = monitor.decide(asked.observation, asked.hazards, memory)
-        reply = ActReply.of(decision, model.model, time.perf_counter() - started)
-        return Response(reply.model_dump_json(), media_type="application/json")
+        return _decide(monitor, model, asked, memory, started)
 
     @app.get("/model", response_model=ModelReply)
     async def about() -> ModelReply:
@@ -90,14 +92,34 @@ def create_app(
     async def healthz() -> dict[str, str]:
         return {"status": "alive"}
 
-    @app.get("/readyz", responses={503: {"description": "draining"}})
+    @app.get("/readyz", responses={503: {"description": "draining, or degraded by its own faults"}})
     async def readyz() -> JSONResponse:
         if state.draining:
             return JSONResponse({"status": "draining"}, status_code=503)
+        faults = monitor.faults.internal()
+        if faults >= MANY_FAULTS:
+            return JSONResponse({"status": "degraded", "internal_faults": faults}, status_code=503)
         return JSONResponse({"status": "ready"})
 
     app.add_middleware(Guard, api_key=api_key, max_body=max_body)
     return app
+
+
+def _decide(
+    monitor: Monitor, model: ModelReply, asked: ActRequest, memory: Memory | None, started: float
+) -> Response:
+    try:
+        decision = monitor.decide(asked.observation, asked.hazards, memory)
+        seconds = time.perf_counter() - started
+        reply = reply_of(decision, asked.request, model.model, model.gate, seconds)
+    except Exception as error:  # noqa: BLE001 - counted and logged; the client has a fallback of its own
+        monitor.faults.note(type(error).__name__, "the decision could not be told", error)
+        return _problem(500, [([], "internal error", "internal")])
+    return Response(reply.model_dump_json(), media_type="application/json")
+
+
+def _memory(value: MemoryJson | None) -> Memory | None:
+    return None if value is None else memory_from_json(value.model_dump())
 
 
 def _act_schema(model: ModelReply) -> dict[str, Any]:
