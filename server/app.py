@@ -9,12 +9,13 @@ from typing import Any
 from fastapi import FastAPI, Request, Response
 from fastapi.responses import JSONResponse
 from pydantic import ValidationError
+from starlette.routing import Route
 from starlette.types import ASGIApp
 
-from decision import Memory, memory_from_json
+from decision import memory_from_json
 from monitor import Monitor
 from server.guard import BodyTooLargeError, Guard
-from server.schema import ActReply, ActRequest, MemoryJson, ModelReply, reply_of
+from server.schema import ActReply, ActRequest, ModelReply, reply_of
 
 MAX_BODY = 65536
 """Most bytes of a request's body: 60 numbers and a thousand hazards fit."""
@@ -70,19 +71,14 @@ def create_app(
     async def act(request: Request) -> Response:
         started = time.perf_counter()
         try:
-            asked = ActRequest.model_validate_json(await request.body())
-        except ValidationError as error:
-            return _unprocessable([(list(item["loc"]), item["msg"], item["type"]) for item in error.errors()])
+            content = await request.body()
         except BodyTooLargeError as error:
             return _problem(413, [([], str(error), "too_large")])
-        if len(asked.observation) != model.observation_size:
-            message = f"must have {model.observation_size} numbers, got {len(asked.observation)}"
-            return _unprocessable([(["observation"], message, "wrong_length")])
-        try:
-            memory = _memory(asked.memory)
-        except ValueError as error:
-            return _unprocessable([(["memory"], str(error), "wrong_memory")])
-        return _decide(monitor, model, asked, memory, started)
+        return _act(monitor, model, content, started)
+
+    # Found first: the same function without FastAPI's handling of parameters, of which it has none. The
+    # declaration above documents it.
+    app.router.routes.insert(0, Route("/act", act, methods=["POST"]))
 
     @app.get("/model", response_model=ModelReply)
     async def about() -> ModelReply:
@@ -105,9 +101,19 @@ def create_app(
     return app
 
 
-def _decide(
-    monitor: Monitor, model: ModelReply, asked: ActRequest, memory: Memory | None, started: float
-) -> Response:
+def _act(monitor: Monitor, model: ModelReply, content: bytes, started: float) -> Response:
+    """Answers a request's body."""
+    try:
+        asked = ActRequest.model_validate_json(content)
+    except ValidationError as error:
+        return _unprocessable([(list(item["loc"]), item["msg"], item["type"]) for item in error.errors()])
+    if len(asked.observation) != model.observation_size:
+        message = f"must have {model.observation_size} numbers, got {len(asked.observation)}"
+        return _unprocessable([(["observation"], message, "wrong_length")])
+    try:
+        memory = None if asked.memory is None else memory_from_json(asked.memory.model_dump())
+    except ValueError as error:
+        return _unprocessable([(["memory"], str(error), "wrong_memory")])
     try:
         decision = monitor.decide(asked.observation, asked.hazards, memory)
         seconds = time.perf_counter() - started
@@ -116,10 +122,6 @@ def _decide(
         monitor.faults.note(type(error).__name__, "the decision could not be told", error)
         return _problem(500, [([], "internal error", "internal")])
     return Response(reply.model_dump_json(), media_type="application/json")
-
-
-def _memory(value: MemoryJson | None) -> Memory | None:
-    return None if value is None else memory_from_json(value.model_dump())
 
 
 def _act_schema(model: ModelReply) -> dict[str, Any]:

@@ -30,7 +30,7 @@ from server.schema import ActReply, ModelReply, decision_of
 FloatArray = NDArray[np.float64]
 
 DEFAULT_TIMEOUT = 0.02
-"""How long a robot waits for its action [s]: one control step, the longest that a certified action may last."""
+"""How long a robot waits for its action [s]: one control step, for which a certified action may last."""
 _CONNECT_TIMEOUT = 5.0
 _EXCERPT = 200
 """Most characters of a reason that come from elsewhere."""
