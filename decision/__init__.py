@@ -4,6 +4,7 @@ Every room speaks these types: the filter fills them, the monitor adds the risk 
 service sends one row of them, its client gives that row back, and the evaluation counts them.
 """
 
+from decision.decider import BatchDecider, Decider
 from decision.decision import SAFE_ACTION, Decision, Decisions, Mode, OpenedBy, Origin
 from decision.fallback import fall_back
 from decision.faults import Faults
@@ -13,6 +14,8 @@ __all__ = [
     "MEMORY",
     "PLAN_STEPS",
     "SAFE_ACTION",
+    "BatchDecider",
+    "Decider",
     "Decision",
     "Decisions",
     "Faults",

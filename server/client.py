@@ -153,10 +153,10 @@ class Client:
             if status != http.client.OK:
                 raise ClientError(f"{url}: /model answered {status}: {_excerpt(content)}")
             model = ModelReply.model_validate_json(content)
-        except (OSError, UnicodeError, http.client.HTTPException) as error:
-            raise ClientError(f"{url}: {str(error) or type(error).__name__}") from error
         except ValidationError as error:
             raise ClientError(f"{url}: its /model is not that of a lagnet service") from error
+        except (OSError, ValueError, http.client.HTTPException) as error:
+            raise ClientError(f"{url}: {_excerpt(str(error) or type(error).__name__)}") from error
         served = [block.model_dump() for block in model.observation_layout]
         if layout is not None and served != [dict(block) for block in layout]:
             raise ClientError(

@@ -122,9 +122,9 @@ class Link:
         if not self._addresses:
             self._addresses = list(socket.getaddrinfo(*self._address, type=socket.SOCK_STREAM))
         fault: OSError | None = None
-        for found in self._addresses:
+        for k, found in enumerate(self._addresses):
             try:
-                self._socket = _open(found, deadline)
+                self._socket = _open(found, remaining(deadline) / (len(self._addresses) - k))
             except OSError as error:
                 fault = error
                 continue
@@ -134,11 +134,11 @@ class Link:
         raise fault or OSError("the host has no address")
 
 
-def _open(found: tuple[Any, ...], deadline: float) -> DeadlineSocket:
+def _open(found: tuple[Any, ...], timeout: float) -> DeadlineSocket:
     family, kind, protocol, _, address = found
     opened = DeadlineSocket(family, kind, protocol)
     try:
-        opened.settimeout(remaining(deadline))
+        opened.settimeout(timeout)
         opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         opened.connect(address)
     except BaseException:

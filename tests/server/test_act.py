@@ -287,6 +287,11 @@ def test_a_body_above_the_limit_is_413(monitor, stated) -> None:
     assert "1000 bytes" in reply.json()["detail"][0]["msg"]
 
 
+def test_a_stated_length_of_any_size_is_413(app) -> None:
+    for digits in (10, 5000):
+        assert app.post("/act", content=b"{}", headers={"content-length": "9" * digits}).status_code == 413
+
+
 def test_the_key_is_asked_for_everywhere_but_at_the_health_checks(monitor, observation) -> None:
     app = TestClient(create_app(monitor, api_key="secret"))
     body = {"observation": observation}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from pathlib import Path
 
 import numpy as np
@@ -9,15 +10,23 @@ import pytest
 
 from decision import MEMORY, Decisions
 from evaluation.service import Service
+from monitor import Monitor
 from pointgoal.observation import layout
 from pointgoal.vector import PointGoalVectorEnv
-from server import ClientError, Fleet
+from server import Client, ClientError, Fleet
 
 
 @pytest.fixture(scope="module")
 def service(tiny_bundle: Path):
     with Service.start(tiny_bundle, "always") as running:
         yield running
+
+
+def test_one_protocol() -> None:
+    for name in ("decide", "decide_batch"):
+        asked = inspect.signature(getattr(Monitor, name))
+        assert inspect.signature(getattr(Fleet, name)) == asked
+    assert inspect.signature(Client.decide) == inspect.signature(Monitor.decide)
 
 
 def test_it_decides_as_the_monitor_does(service, monitor) -> None:
