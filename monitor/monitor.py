@@ -14,19 +14,19 @@ from decision import (
     SAFE_ACTION,
     Decision,
     Decisions,
+    Faults,
     Memory,
     Mode,
     OpenedBy,
     Origin,
+    fall_back,
     next_of_plan,
     texts,
-    unknown,
 )
 from filter import BarrierFilter, FilterConfig, FilterInputError, Robot, Scene
 from guide import DEFAULT_STRENGTH, Guide, Strength
 from models import Bundle
 from monitor.errors import MonitorError, NetworkError
-from monitor.faults import Faults
 from monitor.gate import Gate, GateName
 from monitor.networks import FloatArray, Networks, within
 from pointgoal.observation import layout
@@ -256,23 +256,7 @@ class Monitor:
         return reason
 
     def _fall_back(self, memory: Memory, reason: str) -> Decisions:
-        """The plans go on for as long as they last; then no barrier falls while the robot coasts."""
-        count = len(memory)
-        action, after = next_of_plan(memory)
-        return Decisions(
-            action=np.where((memory["left"] > 0)[:, None], action, self._safe),
-            nominal_action=np.full((count, 2), np.nan),
-            mode=texts(Mode.FALLBACK, count),
-            origin=texts(Origin.PLAN, count),
-            certified=np.zeros(count, np.bool_),
-            barrier=unknown(count),
-            hazard=np.full(count, -1),
-            reason=[reason] * count,
-            risk=unknown(count),
-            threshold=self.gate.threshold,
-            opened_by=texts(OpenedBy.FAULT, count),
-            memory=after,
-        )
+        return fall_back(memory, reason, self.gate.threshold, self._safe)
 
     def _warm_up(self) -> None:
         """Runs the networks and every part of the filter once, with and without given hazards.
