@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -18,16 +19,17 @@ import numpy as np
 import tyro
 from numpy.typing import NDArray
 
-from filter import BarrierFilter, FilterConfig, FilterMemory
+from decision import Memory, Mode
+from filter import BarrierFilter, FilterConfig
 from pointgoal import seeds
 from pointgoal.lidar import encode, nearest
+from pointgoal.loop import Step, drive, groups, side_by_side
 from pointgoal.observation import HAZARD_RADIUS, LIDAR_RANGE, layout
 from pointgoal.seeds import Use
 
 FloatArray = NDArray[np.float64]
 Policy = Callable[[FloatArray, FloatArray, np.random.Generator], FloatArray]
 """Observation (N, 60) and hazards in the body frame (N, n, 2) -> actions (N, 2)."""
-EPISODE_STEPS = 1000
 
 
 @dataclass(frozen=True)
@@ -181,80 +183,97 @@ def run(
 ) -> Outcome:
     """Run episodes of one policy behind one filter."""
     rows, rng = seeds.rows(Use.FILTER, seed, episodes), seeds.generator(Use.FILTER, seed)
-    outcomes = [
-        _run(policy, robot_filter, source, rows[i : i + chunk], level, off, rng, with_memory)
-        for i in range(0, episodes, chunk)
-    ]
-    return Outcome(
-        returns=np.concatenate([one.returns for one in outcomes]),
-        costs=np.concatenate([one.costs for one in outcomes]),
-        violations=np.concatenate([one.violations for one in outcomes]),
-        interventions=float(np.mean([one.interventions for one in outcomes])),
-        fallbacks=float(np.mean([one.fallbacks for one in outcomes])),
-        least=min(one.least for one in outcomes),
-        seconds=float(np.mean([one.seconds for one in outcomes])),
-    )
+    size = side_by_side(episodes, chunk)
+    tally = _Tally(episodes, level)
+    with closing(make_environments(level, size, off)) as env:
+        for part in groups(episodes, size):
+            robots = _Robots(policy, robot_filter, source, off[0], rng, with_memory)
+            for step in drive(env, robots.act, rows[part]):
+                tally.add(part.start, step, robots)
+    return tally.outcome()
 
 
-def _run(
-    policy: Policy,
-    robot_filter: BarrierFilter | None,
-    source: str,
-    rows: list[int],
-    level: int,
-    off: Sequence[Off],
-    rng: np.random.Generator,
-    with_memory: bool,
-) -> Outcome:
-    n = len(rows)
-    env = make_environments(level, n, off)
-    observation, _ = env.reset(seed=rows)
-    returns, costs = np.zeros(n), np.zeros(n)
-    violations = np.zeros(n, dtype=np.int64)
-    alive = np.ones(n, dtype=bool)
-    changed = fallen = 0
-    least = np.inf
-    spent = 0.0
-    memory = FilterMemory.empty(n)
-    noisy = off[0].distance + off[0].bearing + off[0].speed > 0.0
-    for _ in range(EPISODE_STEPS):
-        hazards = env.hazards_in_body_frame()
-        seen, shown = _perturbed(observation, hazards, off[0], rng) if noisy else (observation, hazards)
-        action = policy(seen, shown, rng)
-        if robot_filter is not None:
-            start = time.perf_counter()
-            result = robot_filter.filter(
-                seen, action, shown if source == "given" else None, memory if with_memory else None
-            )
-            spent += time.perf_counter() - start
-            memory = result.memory
-            action = result.action
-            changed += int((result.mode[alive] > 0).sum())
-            fallen += int((result.mode[alive] == 2).sum())
-        observation, reward, terminated, truncated, info = env.step(action)
-        returns[alive] += reward[alive]
-        costs[alive] += info["cost"][alive]
-        edge = _nearest_edge(observation, info)
-        # At level 2 vases cost as well, and a step with a cost need not be one in a hazard.
-        inside = edge < 0.0 if level == 2 else info["cost"] > 0.0
-        violations[alive] += inside[alive]
-        least = min(least, float(edge[alive].min(initial=np.inf)))
-        alive &= ~(terminated | truncated)
-        if not alive.any():
-            break
-    env.close()
-    steps = n * EPISODE_STEPS
-    return Outcome(returns, costs, violations, changed / steps, fallen / steps, least, spent / steps)
+class _Robots:
+    """N robots from their episodes' starts on, under one policy behind one filter.
 
-
-def _nearest_edge(observation: FloatArray, info: dict[str, Any]) -> FloatArray:
-    """Distance (N,) from the nearest hazard's edge after a step [m], from the true scans.
-
-    Where an episode ended, the positions and the observation are the next one's; the last one's scan is kept.
+    Attributes:
+        mode: (N,) texts of `Mode`, of the last step.
+        seconds: what the filter took in it.
     """
-    seen = observation
-    if "final_obs" in info:
-        seen = np.where(info["_final_obs"][:, None], info["final_obs"], observation)
+
+    def __init__(
+        self,
+        policy: Policy,
+        robot_filter: BarrierFilter | None,
+        source: str,
+        off: Off,
+        rng: np.random.Generator,
+        with_memory: bool,
+    ) -> None:
+        self._policy, self._filter, self._source = policy, robot_filter, source
+        self._off, self._rng, self._with_memory = off, rng, with_memory
+        self._memory: Memory | None = None
+        self.mode = np.empty(0, np.str_)
+        self.seconds = 0.0
+
+    def act(self, observation: FloatArray, env: Any) -> FloatArray:
+        hazards = env.hazards_in_body_frame()
+        if self._off.distance + self._off.bearing + self._off.speed > 0.0:
+            observation, hazards = _perturbed(observation, hazards, self._off, self._rng)
+        action = self._policy(observation, hazards, self._rng)
+        if self._filter is None:
+            self.mode = np.full(len(action), Mode.NOMINAL)
+            return action
+        started = time.perf_counter()
+        given = hazards if self._source == "given" else None
+        decisions = self._filter.filter(observation, action, given, self._memory)
+        self.seconds = time.perf_counter() - started
+        self._memory = decisions.memory if self._with_memory else None
+        self.mode = decisions.mode
+        return decisions.action
+
+
+class _Tally:
+    """Adds up what happens in E episodes."""
+
+    def __init__(self, count: int, level: int) -> None:
+        self._level = level
+        self._returns, self._costs = np.zeros(count), np.zeros(count)
+        self._violations = np.zeros(count, dtype=np.int64)
+        self._steps = self._changed = self._fallen = self._decided = 0
+        self._least, self._spent = np.inf, 0.0
+
+    def add(self, first: int, step: Step, robots: _Robots) -> None:
+        """Adds one step of the robots whose episodes are numbered from `first` on."""
+        rows = np.flatnonzero(step.running)
+        edge = _nearest_edge(step.after[rows])
+        # At level 2 vases cost as well, and a step with a cost need not be one in a hazard.
+        inside = edge < 0.0 if self._level == 2 else step.cost[rows] > 0.0
+        self._returns[first + rows] += step.reward[rows]
+        self._costs[first + rows] += step.cost[rows]
+        self._violations[first + rows] += inside
+        self._least = min(self._least, float(edge.min()))
+        self._steps += len(rows)
+        self._changed += int((robots.mode[rows] != Mode.NOMINAL).sum())
+        self._fallen += int((robots.mode[rows] == Mode.FALLBACK).sum())
+        self._decided += len(robots.mode)
+        self._spent += robots.seconds
+
+    def outcome(self) -> Outcome:
+        """What the episodes gave."""
+        return Outcome(
+            returns=self._returns,
+            costs=self._costs,
+            violations=self._violations,
+            interventions=self._changed / self._steps,
+            fallbacks=self._fallen / self._steps,
+            least=self._least,
+            seconds=self._spent / self._decided,
+        )
+
+
+def _nearest_edge(seen: FloatArray) -> FloatArray:
+    """Distance (N,) from the nearest hazard's edge after a step [m], from the true scans then."""
     if seen.shape[1] == layout(0).size:
         return np.full(len(seen), np.inf)
     strongest = seen[:, layout(1).slice("hazards_lidar")].max(axis=1)

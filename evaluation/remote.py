@@ -7,12 +7,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Protocol
 
-from server.fleet import Fleet
-
 from decision import Decision, Decisions
 from evaluation.closed_loop import Decides, FloatArray
 from evaluation.errors import ServiceError, ServiceGoneError
-from server import ClientError, ModelReply
+from server import ClientError, Fleet, ModelReply
 from server.serve import ServeError, read_api_key
 
 _MEASURED = ("bad input", "time-out")

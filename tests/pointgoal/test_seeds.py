@@ -71,10 +71,10 @@ USERS = {
     "calibration 0": lambda: play(run_of(0), 50, 1),
     "calibration 1": lambda: play(run_of(1), 50, 1),
     "comparison": lambda: play(run_of(0), 50, 1, use=Use.COMPARISON),
-    "evaluation 0": lambda: run_episodes("PointGoal1-v0", SimpleNamespace(start=lambda count: None), 100),
-    "evaluation 1": lambda: run_episodes("PointGoal1-v0", SimpleNamespace(start=lambda count: None), 100, 1),
+    "evaluation 0": lambda: run_episodes("PointGoal1-v0", None, 100),
+    "evaluation 1": lambda: run_episodes("PointGoal1-v0", None, 100, 1),
     "demo": lambda: run_episodes(
-        "PointGoal1-v0", SimpleNamespace(start=lambda count: None), 20, use=Use.DEMO
+        "PointGoal1-v0", None, 20, use=Use.DEMO
     ),
     "filter": lambda: filter_closed_loop.run(filter_closed_loop.random_policy, None, "given", 100),
     "simulation": lambda: simulation.measure(1, 100, 1, simulation.Settings()),
