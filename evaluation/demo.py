@@ -22,7 +22,7 @@ from evaluation.errors import EvaluateError, ServiceError, ServiceGoneError
 from evaluation.pictures import Drive, animate, draw_drives, drive
 from evaluation.progress import progress_bar
 from evaluation.statistics import summarise
-from evaluation.tables import TABLE_WIDTH, tables
+from evaluation.tables import TABLE_WIDTH, table_console, tables
 from models import Bundle, BundleError
 from monitor import GateName
 from pointgoal.loop import SIDE_BY_SIDE
@@ -157,7 +157,7 @@ def main() -> None:
     config = tyro.cli(DemoConfig, prog="python -m evaluation.demo")
     signal.signal(signal.SIGTERM, _interrupt)
     try:
-        run_demo(config, Console())
+        run_demo(config, table_console())
     except (EvaluateError, BundleError, ServiceError, OSError) as error:
         _complain(error)
         sys.exit(2)

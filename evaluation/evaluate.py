@@ -19,7 +19,7 @@ from evaluation.closed_loop import Decides, Episodes, HazardSource, TaskError, r
 from evaluation.errors import EvaluateError, ServiceError, ServiceGoneError
 from evaluation.progress import progress_bar
 from evaluation.statistics import summarise
-from evaluation.tables import TABLE_WIDTH, tables
+from evaluation.tables import table_console, tables
 from guide import DEFAULT_STRENGTH, Strength
 from models import Bundle, BundleError
 from monitor import GateName, Monitor, MonitorError
@@ -164,7 +164,7 @@ def main() -> None:
     Exit status 0; 1 if the service failed on the way; 2 if nothing could be run as asked.
     """
     config = tyro.cli(EvaluateConfig, prog="lagnet-evaluate")
-    console = Console(width=None if sys.stdout.isatty() else TABLE_WIDTH)
+    console = table_console()
     try:
         runs, who = evaluate(config, console)
         summaries = {_LABELS[source]: summarise(episodes) for source, episodes in runs.items()}

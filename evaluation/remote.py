@@ -1,20 +1,17 @@
-"""Robots that ask a running service, and what happens when it goes away."""
+"""Robots that ask a running service."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
-from decision import Decision, Decisions
-from evaluation.closed_loop import Decides, FloatArray
-from evaluation.errors import ServiceError, ServiceGoneError
+from evaluation.closed_loop import Decides
+from evaluation.errors import ServiceError
+from evaluation.watched import Watched
 from server import ClientError, Fleet, ModelReply
 from server.serve import ServeError, read_api_key
-
-_MEASURED = ("bad input", "time-out")
-"""Kinds of faults that are the robots' fate, not the evaluation's end: they are in its figures."""
 
 
 @contextmanager
@@ -35,75 +32,17 @@ def asked(
     """
     try:
         key = read_api_key(key_file)
-        with Fleet(url, layout, timeout, key) as fleet:
-
-            def probe() -> None:
-                Fleet(url, layout, timeout, key).close()
-
-            yield Watched(fleet, probe), fleet.model()
-    except (ClientError, ServeError) as error:
+    except ServeError as error:
         raise ServiceError(str(error)) from error
 
+    def connect() -> Fleet:
+        try:
+            return Fleet(url, layout, timeout, key)
+        except ClientError as error:
+            raise ServiceError(str(error)) from error
 
-class _Faults(Protocol):
-    @property
-    def counts(self) -> dict[str, int]: ...
-
-
-class _Asks(Decides, Protocol):
-    @property
-    def faults(self) -> _Faults: ...
-
-
-class Watched:
-    """Decides through a service, and raises once that is gone.
-
-    Robots whose service does not answer go on by themselves; figures of such a drive would say nothing of
-    the service. So the clients' own faults end it: a connection that failed, an answer that is none. A late
-    reply does not, and is in the figures as the fallback that it was; but where none of the robots had its
-    reply in time, the service is asked whether it is there at all.
-
-    Args:
-        fleet: decides through the service, and counts its own faults.
-        probe: asks whether the service is there; raises ClientError if it is not.
-    """
-
-    def __init__(self, fleet: _Asks, probe: Callable[[], None]) -> None:
-        self._fleet = fleet
-        self._probe = probe
-
-    def decide(self, observation: FloatArray, hazards: Any = None, memory: Any = None) -> Decision:
-        """Decides for one robot.
-
-        Raises:
-            ServiceGoneError: if the service is gone.
-        """
-        before = self._counts()
-        decision = self._fleet.decide(observation, hazards, memory)
-        self._check(before, [decision.reason])
-        return decision
-
-    def decide_batch(self, observation: FloatArray, hazards: Any = None, memory: Any = None) -> Decisions:
-        """Decides for N robots.
-
-        Raises:
-            ServiceGoneError: if the service is gone.
-        """
-        before = self._counts()
-        decisions = self._fleet.decide_batch(observation, hazards, memory)
-        self._check(before, decisions.reason)
-        return decisions
-
-    def _counts(self) -> dict[str, int]:
-        return dict(self._fleet.faults.counts)
-
-    def _check(self, before: dict[str, int], reasons: Sequence[str | None]) -> None:
-        new = {kind: count - before.get(kind, 0) for kind, count in self._fleet.faults.counts.items()}
-        said = next((reason for reason in reasons if reason), "no reason")
-        if any(count for kind, count in new.items() if kind not in _MEASURED):
-            raise ServiceGoneError(f"the service failed while robots were driving: {said}")
-        if new.get("time-out", 0) == len(reasons):
-            try:
-                self._probe()
-            except ClientError as error:
-                raise ServiceGoneError(f"the service is gone while robots were driving: {error}") from error
+    with connect() as fleet:
+        try:
+            yield Watched(fleet, lambda: connect().close()), fleet.model()
+        except ClientError as error:  # further robots are connected as they are needed
+            raise ServiceError(str(error)) from error

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
 from typing import Any
 
 from rich import box
-from rich.console import Group
+from rich.console import Console, Group
 from rich.table import Table
 
 from decision import OpenedBy, Origin
@@ -31,6 +32,11 @@ _ORIGINS = {
 }
 
 
+def table_console() -> Console:
+    """Where tables are printed: as wide as the terminal, or `TABLE_WIDTH` where there is none."""
+    return Console(width=None if sys.stdout.isatty() else TABLE_WIDTH)
+
+
 def tables(title: str, summaries: Mapping[str, Summary]) -> Group:
     """What became of the robots, a row a label; and why gate and filter acted, a column a label."""
     return Group(outcomes(title, summaries), actions(summaries))
@@ -49,7 +55,7 @@ def outcomes(title: str, summaries: Mapping[str, Summary]) -> Table:
         "95 %\ninterval",
         "decision [µs]\np50 / p99",
     ):
-        table.add_column(name, justify="right", no_wrap=True)
+        table.add_column(name, justify="right")
     for label, s in summaries.items():
         table.add_row(
             label,
