@@ -1,4 +1,4 @@
-"""Robots that ask a service: it decides as the monitor, it may die, and nothing that is started outlives us."""
+"""Robots that ask a service: it decides as the monitor, it may die, and none that we start outlives us."""
 
 from __future__ import annotations
 
