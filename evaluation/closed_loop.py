@@ -10,7 +10,7 @@ from typing import Any, Literal, Protocol
 
 import gymnasium
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from decision import MEMORY, Decision, Decisions, Memory, Mode, OpenedBy, Origin
 from pointgoal import seeds
@@ -33,12 +33,16 @@ class TaskError(ValueError):
 
 
 class Decides(Protocol):
-    """What decides: `monitor.Monitor` in this process, `server.fleet.Fleet` through a service."""
+    """What decides: `monitor.Monitor` in this process, `server.Fleet` through a service."""
 
-    def decide(self, observation: FloatArray, hazards: Any = None, memory: Any = None) -> Decision:
+    def decide(
+        self, observation: ArrayLike, hazards: ArrayLike | None = None, memory: Memory | np.void | None = None
+    ) -> Decision:
         """Decides for one robot: observation (O,), hazards (n, 2) [m] or None, its memory."""
 
-    def decide_batch(self, observation: FloatArray, hazards: Any = None, memory: Any = None) -> Decisions:
+    def decide_batch(
+        self, observation: ArrayLike, hazards: ArrayLike | None = None, memory: Memory | None = None
+    ) -> Decisions:
         """Decides for N robots: observation (N, O), hazards (N, n, 2) [m] or None, their memory (N,)."""
 
 

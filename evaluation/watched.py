@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Protocol
+from typing import Protocol
 
-from decision import Decision, Decisions
-from evaluation.closed_loop import Decides, FloatArray
+import numpy as np
+from numpy.typing import ArrayLike
+
+from decision import Decision, Decisions, Memory
+from evaluation.closed_loop import Decides
 from evaluation.errors import ServiceError, ServiceGoneError
 
 _MEASURED = ("bad input", "time-out")
@@ -50,14 +53,18 @@ class Watched:
         self._fleet = fleet
         self._probe = probe
 
-    def decide(self, observation: FloatArray, hazards: Any = None, memory: Any = None) -> Decision:
+    def decide(
+        self, observation: ArrayLike, hazards: ArrayLike | None = None, memory: Memory | np.void | None = None
+    ) -> Decision:
         """Decides for one robot."""
         before = dict(self._fleet.faults.counts)
         decision = self._fleet.decide(observation, hazards, memory)
         self._check(before, [decision.reason])
         return decision
 
-    def decide_batch(self, observation: FloatArray, hazards: Any = None, memory: Any = None) -> Decisions:
+    def decide_batch(
+        self, observation: ArrayLike, hazards: ArrayLike | None = None, memory: Memory | None = None
+    ) -> Decisions:
         """Decides for N robots."""
         before = dict(self._fleet.faults.counts)
         decisions = self._fleet.decide_batch(observation, hazards, memory)
