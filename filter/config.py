@@ -39,8 +39,9 @@ class FilterConfig:
     """Radius of every hazard [m]."""
     rate: float = 0.5
     """Share of a barrier that the QP lets one control step take away, in (0, 1]; 1 brakes last."""
-    keep_off: float = 0.005
-    """Clearance that the QP drives back to [m]: at the very margin the robot could not even turn."""
+    keep_off: float = 0.02
+    """Clearance from which on a barrier row lets none of it be lost [m]: at the very margin the robot could not
+    even turn, for it turns about its centre of mass."""
     hysteresis: float = 0.001
     """Clearance beyond the margin that a nominal action must leave, and a backup need not [m]."""
     thrust_weight: float = 4.0

@@ -109,7 +109,7 @@ def see(
     for k in range(observation.shape[0]):
         for i in range(observation.shape[1]):
             if not math.isfinite(observation[k, i]):
-                return k * observation.shape[1] + i
+                return int(k * observation.shape[1] + i)
         one = seen[k]
         one.vx = observation[k, velocity]
         one.vy = observation[k, velocity + 1]

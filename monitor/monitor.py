@@ -58,9 +58,11 @@ class Monitor:
         action_filter: the filter.
         gate: when the filter is active.
         threshold: λ above which the gate `risk` opens; None takes the bundle's.
+        guide: how much the filter's guide may do, to be told.
 
     Attributes:
         faults: what went wrong so far.
+        robot: the constants of the bundle's robot.
 
     Raises:
         MonitorError: for an unknown gate, a threshold that is not finite and >= 0, or a bundle whose
@@ -74,10 +76,13 @@ class Monitor:
         action_filter: ActionFilter,
         gate: GateName = "risk",
         threshold: float | None = None,
+        guide: Strength = "off",
     ) -> None:
         _check_layout(bundle)
         manifest = bundle.manifest
         self.bundle = bundle
+        self.robot = _robot(bundle)
+        self.guide: Strength = guide
         self.faults = Faults()
         wanted = manifest.threshold if threshold is None else float(threshold)
         self.gate = Gate(gate, wanted)
@@ -117,7 +122,7 @@ class Monitor:
             networks = Networks(bundle)
         except (NetworkError, ValueError) as error:
             raise MonitorError(f"{bundle.path}: {error}") from error
-        monitor = Monitor(bundle, networks, action_filter, gate, threshold)
+        monitor = Monitor(bundle, networks, action_filter, gate, threshold, guide)
         monitor._warm_up()
         return monitor
 

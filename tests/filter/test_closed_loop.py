@@ -3,11 +3,11 @@
 import gymnasium
 import numpy as np
 import pytest
+from filter.backups import BACKUPS, law
+from filter.robot import State, stopping
 
 from filter import BarrierFilter, FilterConfig, FilterMemory, Mode, SafetyFilter
-from filter.backups import BACKUPS, law
 from filter.config import MODEL_ERROR, settings
-from filter.robot import State, stopping
 from pointgoal.observation import HAZARD_RADIUS
 from pointgoal.vector import PointGoalVectorEnv
 

@@ -1,9 +1,8 @@
 import numpy as np
-from hypothesis import given, settings
-from hypothesis import strategies as st
-
 from filter.lidar import CONES, decode, decode_goal, likeliest
 from filter.obstacles import COLUMNS, gap
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 RADIUS = 0.2
 bearings = st.one_of(

@@ -1,12 +1,12 @@
 import numpy as np
 import pytest
+from filter.backups import BACKUPS, STEPS, TURN, law
+from filter.robot import Robot, State, advance, follow, stopping
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from filter.backups import BACKUPS, STEPS, TURN, law
 from filter.config import MODEL_ERROR, FilterConfig
 from filter.config import settings as make_settings
-from filter.robot import Robot, State, advance, follow, stopping
 
 ROBOT = Robot()
 speeds = st.floats(-1.5, 1.5)

@@ -6,10 +6,10 @@ import json
 
 import numpy as np
 import pytest
+from monitor.memory import join, take
 
 from filter import FilterMemory
 from monitor import memory_from_json, memory_to_json
-from monitor.memory import join, take
 
 
 def test_it_survives_json() -> None:
