@@ -252,7 +252,7 @@ def _run(line: Line, rows: list[int], rng: np.random.Generator) -> Outcome:
         if decided is not None:
             counts["open"] += int((decided.gate_open & alive).sum())
             counts["replaced"] += int((decided.certified & (decided.origin != "") & alive).sum())
-            counts.update(Counter(decided.origin[alive].tolist()))
+            counts.update(f"by {origin}" for origin in decided.origin[alive].tolist())
     env.close()
     steps = n * EPISODE_STEPS
     shares = {name: counts[name] / steps for name in SHARES}
@@ -273,7 +273,7 @@ POLICIES: dict[str, Policy] = {
     "attacker": attacker_policy,
     "seeker": seeker_policy,
 }
-SHARES = ("open", *(origin.value for origin in Origin), "replaced")
+SHARES = ("open", *(f"by {origin}" for origin in Origin), "replaced")
 """What is counted of the steps."""
 
 
@@ -309,20 +309,22 @@ WORLDS = {
 }
 SHIPPED, REWARD_ONLY = "models/pointgoal1", "models/ppo1"
 SOURCES: tuple[Source, ...] = ("given", "lidar")
+GATES: tuple[Gate, ...] = ("always", "floor", "none")
 
 
 def lines() -> Iterator[Line]:
-    """What docs/filter.md shows."""
-    policies = (REWARD_ONLY, SHIPPED, "random", "thrust", "attacker")
-    for policy in policies:
+    """What docs/filter.md shows, what matters most first."""
+    policies = (REWARD_ONLY, "random", "thrust", "attacker")
+    for source, policy, strength in itertools.product(SOURCES, (SHIPPED, REWARD_ONLY), STRENGTHS):
+        yield Line(policy, "plain", source, "always", strength)
+    for world in ("plain", "off", "noise", "level 2"):
+        for gate, policy, source in itertools.product(GATES[:2], policies, SOURCES):
+            if (world, gate, policy) != ("plain", "always", REWARD_ONLY):
+                yield Line(policy, world, source, gate, DEFAULT_STRENGTH)
+    for source in SOURCES:
+        yield Line(SHIPPED, "plain", source, "floor", DEFAULT_STRENGTH)
+    for policy in (*policies, SHIPPED):
         yield Line(policy, "plain", "given", "none", "off")
-    for gate, world in itertools.product(("always", "floor"), ("plain", "off", "noise", "level 2")):
-        for policy, source in itertools.product(policies, SOURCES):
-            if policy != SHIPPED or world == "plain":
-                yield Line(policy, world, source, gate, DEFAULT_STRENGTH)  # type: ignore[arg-type]
-    for policy, source, strength in itertools.product((SHIPPED, REWARD_ONLY), SOURCES, STRENGTHS):
-        if strength != DEFAULT_STRENGTH:
-            yield Line(policy, "plain", source, "always", strength)
     for policy, source in itertools.product((REWARD_ONLY, "attacker"), SOURCES):
         yield Line(policy, "plain", source, "always", DEFAULT_STRENGTH, memory=False)
     for world, source in itertools.product(list(WORLDS)[5:], SOURCES):
@@ -383,7 +385,7 @@ def table(rows: list[dict[str, str]]) -> str:
     shares = ("open", "QP", "search", "plan", "least harm", "guide", "replaced")
     lines = [f"| {' | '.join((*head, *shares))} |", "|---" * (len(head) + len(shares)) + "|"]
     for row in rows:
-        percent = {name: 100 * float(row[name]) for name in SHARES}
+        percent = {name.removeprefix("by "): 100 * float(row[name]) for name in SHARES}
         percent["QP"] = percent["barrier"] + percent["circulation"]
         world = row["world"] + ("" if row["memory"] == "True" else ", no memory")
         names = (Path(row["policy"]).name, world, row["source"], row["gate"], row["guide"])

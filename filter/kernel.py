@@ -99,10 +99,10 @@ def see(
 ) -> int:
     """Find all robots' obstacles and backups; the last three arguments receive them.
 
-    ``columns`` tells where in an ``observation`` (N, O) the velocity ahead, followed by that to the left, and
-    the yaw rate stand, where the hazards' lidar starts and ends, and where the goal's starts. ``given`` (N, n,
-    2) are hazards [m]; ``source`` (N, M) receives each obstacle's hazard, or n + its bin. Returns the place of
-    the first number of all observations that is not finite, -1 if there is none.
+    ``columns`` tells where in an ``observation`` (N, O) the velocity ahead, followed by that to the left,
+    and the yaw rate stand, where the hazards' lidar starts and ends, and where the goal's starts. ``given``
+    (N, n, 2) are hazards [m]; ``source`` (N, M) receives each obstacle's hazard, or n + its bin. Returns the
+    place of the first number of all observations that is not finite, -1 if there is none.
     """
     config = settings[0]
     velocity, yaw, first, last, _ = columns
@@ -140,8 +140,8 @@ def screen(
 ) -> int:
     """Look for certificates of the nominal actions (N, 2) where the gate is open; how many have none.
 
-    Where ``active`` (N,) is False, the sure backup stands for one. ``certified`` (N,) receives which have one;
-    a remembered ``side`` (N,) fades; ``left`` (N,) and ``plan`` (N, PLAN_STEPS, 2) receive the plans.
+    Where ``active`` (N,) is False, the sure backup stands for one. ``certified`` (N,) receives which have
+    one; a remembered ``side`` (N,) fades; ``left`` (N,) and ``plan`` (N, PLAN_STEPS, 2) receive the plans.
     """
     config = settings[0]
     refused = 0

@@ -84,9 +84,9 @@ def barrier_rows(
 ) -> int:
     """Write the barrier rows of one robot's QP; how many there are.
 
-    They are linearised about ``about`` (2,), for a ``backup`` and the steps for which it thrusts after the step.
-    ``now`` (>= M,) is each obstacle's clearance under the present state's best backup [m]; ``G`` (>= M, 2) and
-    ``h`` (>= M,) receive the rows that can bind in the box; ``work`` (3, >= M) is scratch.
+    They are linearised about ``about`` (2,), for a ``backup`` and the steps that it thrusts after the step.
+    ``now`` (>= M,) is each obstacle's clearance under the present state's best backup [m]; ``G`` (>= M, 2)
+    and ``h`` (>= M,) receive the rows that can bind in the box; ``work`` (3, >= M) is scratch.
     """
     f, w = about
     df = _PROBE if f < 0.0 else -_PROBE

@@ -85,13 +85,8 @@ class Scene:
 def look(settings: NDArray[np.void], observation: FloatArray, given: FloatArray | None) -> Scene:
     """Find obstacles and best backups.
 
-    Args:
-        settings: (1,) of `SETTINGS`.
-        observation: (N, 60) or (N, 28).
-        given: (N, n, 2) hazards [m]; None: none are given.
-
-    Raises:
-        FilterInputError: if the observation has a value that is not finite.
+    ``observation`` is (N, 60) or (N, 28), ``given`` (N, n, 2) hazards [m] or None; a value of the observation
+    that is not finite raises FilterInputError.
     """
     n, width = observation.shape
     columns = _COLUMNS[width]

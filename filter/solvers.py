@@ -254,7 +254,7 @@ def solve_batch(
 ) -> tuple[FloatArray, BoolArray]:
     """Solve N problems.
 
-    ``reference`` (N, 2), ``G`` (N, M, 2) and ``h`` (N, M) are theirs, ``rows`` (N,) tells how many rows count.
+    ``reference`` (N, 2), ``G`` (N, M, 2) and ``h`` (N, M) are theirs; ``rows`` (N,) says how many rows count.
 
     Returns:
         The solutions (N, 2), the reference where there is none, and whether there is one (N,).

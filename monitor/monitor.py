@@ -47,8 +47,7 @@ class ActionFilter(Protocol):
 class Monitor:
     """Watches one policy: `decide` turns an observation into the action to send.
 
-    It never fails open. Whatever goes wrong inside (a network gives NaN, the filter raises or answers
-    nonsense, the observation has another length) ends in mode "fallback" and the reason: the plan in the
+    It never fails open. Whatever goes wrong inside ends in mode "fallback" and the reason: the plan in the
     robot's memory goes on for as long as it lasts, then the robot coasts. The nominal action is sent only if
     everything that should have looked at it did.
 
@@ -142,8 +141,7 @@ class Monitor:
         """
         past = np.zeros(1, MEMORY)
         try:
-            if memory is not None:
-                past = _one_robots_memory(memory)
+            past = _memory_of(1, memory)
             row = np.array(observation, dtype=np.float64)[None]
             given = None if hazards is None else _one_robots_hazards(hazards)
         except (TypeError, ValueError) as error:
@@ -164,9 +162,8 @@ class Monitor:
             memory: the `memory` of these robots' last decisions, or None.
 
         Raises:
-            ValueError: if the observation is not an array (N, O) of numbers, for then N is unknown, or the
-                hazards or the memory are not those of N robots. A fault in one robot's row gives that robot
-                the fallback and leaves the others alone.
+            ValueError: if the observation is not an array (N, O) of numbers, or the hazards or the memory are
+                not those of N robots. A fault in one row gives that robot alone the fallback.
         """
         rows = np.array(observation, dtype=np.float64)
         if rows.ndim != 2:
@@ -176,11 +173,7 @@ class Monitor:
         given = None if hazards is None else np.asarray(hazards, dtype=np.float64)
         if given is not None and (given.ndim != 3 or given.shape[::2] != (len(rows), 2)):
             raise ValueError(f"hazards must have shape [{len(rows)}, n, 2], got {given.shape}")
-        if memory is None:
-            memory = np.zeros(len(rows), MEMORY)
-        elif getattr(memory, "dtype", None) != MEMORY or memory.shape != (len(rows),):
-            raise ValueError(f"memory is not that of {len(rows)} robots")
-        return self._decide_or_fall_back(rows, given, memory)
+        return self._decide_or_fall_back(rows, given, _memory_of(len(rows), memory))
 
     def _decide_or_fall_back(
         self, observation: FloatArray, hazards: FloatArray | None, memory: Memory
@@ -320,10 +313,13 @@ def _one_robots_hazards(hazards: ArrayLike) -> FloatArray:
     return given[None]
 
 
-def _one_robots_memory(memory: Memory | np.void) -> Memory:
-    if getattr(memory, "dtype", None) != MEMORY or memory.size != 1:
-        raise ValueError("the memory is not that of one robot")
-    return np.asarray(memory).reshape(1)
+def _memory_of(count: int, memory: Memory | np.void | None) -> Memory:
+    """The memory (count,) of so many robots; None is that before a first step."""
+    if memory is None:
+        return np.zeros(count, MEMORY)
+    if getattr(memory, "dtype", None) != MEMORY or memory.size != count:
+        raise ValueError(f"the memory is not that of {count} robots")
+    return np.asarray(memory).reshape(count)
 
 
 def _check_layout(bundle: Bundle) -> None:

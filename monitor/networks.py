@@ -73,14 +73,8 @@ def within(
 ) -> bool:
     """Which of N actions and scores are numbers within their bounds; whether all are.
 
-    Such an action has float32's rounding clipped off: onnxruntime's tanh, for one, reaches 1.0000001.
-
-    Args:
-        action: [N, a] of the policy; clipped in place where it is sound.
-        low: [a].
-        high: [a].
-        risk: [N], sound from 0 on.
-        sound: [N] receives which are.
+    Such an ``action`` (N, a) has float32's rounding clipped off, in place: onnxruntime's tanh reaches 1.0000001.
+    A ``risk`` (N,) is one from 0 on; ``sound`` (N,) receives which are.
     """
     for k in range(len(action)):
         sound[k] = 0.0 <= risk[k] < np.inf
