@@ -97,7 +97,7 @@ def look(settings: NDArray[np.void], observation: FloatArray, given: FloatArray 
     obstacles, source = np.empty((n, size, COLUMNS)), np.empty((n, size), dtype=np.int64)
     bad = see(settings, observation, columns.read, given, seen, obstacles, source)
     if bad >= 0:
-        raise FilterInputError(f"observation[{bad % width}]", f"is {observation.flat[bad]}")
+        raise FilterInputError(f"observation[{bad % width}]", f"must be finite, got {observation.flat[bad]}")
     return Scene(observation, columns.read, given, seen, obstacles, source)
 
 

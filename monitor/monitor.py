@@ -47,9 +47,8 @@ class ActionFilter(Protocol):
 class Monitor:
     """Watches one policy: `decide` turns an observation into the action to send.
 
-    It never fails open. Whatever goes wrong inside ends in mode "fallback" and the reason: the plan in the
-    robot's memory goes on for as long as it lasts, then the robot coasts. The nominal action is sent only if
-    everything that should have looked at it did.
+    It never fails open. Whatever goes wrong ends in mode "fallback" and the reason: the plan in the robot's
+    memory goes on, then the robot coasts. The nominal action is sent only if all that should look at it did.
 
     Args:
         bundle: the checked bundle.
@@ -200,6 +199,8 @@ class Monitor:
             raise FilterInputError("observation", f"must have {size} numbers, got {observation.shape[1:]}")
         scene = self._filter.look(observation, hazards)
         nominal, risk = self._networks.run(observation)
+        if nominal.shape != (len(observation), 2) or risk.shape != nominal.shape[:1]:
+            raise NetworkError(f"the networks gave shapes {nominal.shape} and {risk.shape}")
         sound = np.empty(len(risk), np.bool_)
         all_sound = within(nominal, self._low, self._high, risk, sound)
         opened_by = self.gate.opened_by(risk, scene.low)
