@@ -3,10 +3,10 @@ VENV := .venv
 BIN := $(VENV)/bin
 BUNDLE ?= models/pointgoal1
 
-.PHONY: help setup demo test lint format benchmark clean
+.PHONY: help setup demo test test-long lint format benchmark clean
 
 help: ## what can be made
-	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
 
 setup: $(VENV)/.installed ## install everything into .venv
 
@@ -22,8 +22,11 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 demo: setup ## the robot in MuJoCo, driven through POST /act, with and without the filter
 	$(BIN)/python -m evaluation.demo $(BUNDLE) --out demo
 
-test: setup ## the whole test suite
+test: setup ## the test suite
 	$(BIN)/python -m pytest
+
+test-long: setup ## the tests that take longer
+	$(BIN)/python -m pytest -m long
 
 lint: setup ## ruff and mypy, as CI runs them
 	$(BIN)/ruff check .

@@ -11,12 +11,15 @@ from numpy.typing import NDArray
 PLAN_STEPS = 20
 """Control steps for which a plan thrusts at most: 0.4 s; a full brake from top speed takes 0.36 s."""
 
-MEMORY = np.dtype([("side", "i1"), ("guided", "i1"), ("left", "i1"), ("plan", "f8", (PLAN_STEPS, 2))])
+MEMORY = np.dtype(
+    [("side", "i1"), ("guided", "i1"), ("planned", "?"), ("left", "i1"), ("plan", "f8", (PLAN_STEPS, 2))]
+)
 """One robot's memory; zeros before its first step.
 
 - ``side``: the side on which the robot passes what is in its way, 1 left, -1 right, 0 none, times the steps
   for which that is still remembered.
 - ``guided``: the side on which the guide is leading the robot past something, 1 left, -1 right, else 0.
+- ``planned``: whether there is a certified plan; one without actions is to coast.
 - ``left``: how many actions of the plan are left.
 - ``plan``: (PLAN_STEPS, 2) what is left of the certified backup, action by action; after it the robot coasts.
 """
@@ -41,7 +44,7 @@ def memory_to_json(memory: np.void) -> dict[str, Any]:
     return {
         "side": int(memory["side"]),
         "guided": int(memory["guided"]),
-        "plan": memory["plan"][:left].tolist(),
+        "plan": memory["plan"][:left].tolist() if memory["planned"] else None,
     }
 
 
@@ -59,12 +62,14 @@ def memory_from_json(value: Mapping[str, Any]) -> Memory:
         if isinstance(number, bool) or not isinstance(number, int) or not least <= number <= -least:
             raise ValueError(f"memory.{name} must be a whole number in {least}..{-least}, got {number!r}")
         memory[name] = number
+    if value["plan"] is None:
+        return memory
     try:
         plan = np.asarray(value["plan"], dtype=np.float64).reshape(-1, 2)
     except (TypeError, ValueError) as error:
         raise ValueError("memory.plan must be a list of pairs of numbers") from error
     if len(plan) > PLAN_STEPS or not (np.abs(plan) <= 1.0).all():
         raise ValueError(f"memory.plan must hold at most {PLAN_STEPS} pairs of numbers in -1..1")
-    memory["left"] = len(plan)
+    memory["planned"], memory["left"] = True, len(plan)
     memory["plan"][0, : len(plan)] = plan
     return memory

@@ -120,9 +120,8 @@ class BarrierFilter:
         self, observation: ArrayLike, nominal_action: ArrayLike, hazards: ArrayLike | None = None
     ) -> Problem | None:
         """The first QP of one robot without memory, None if its action passes; arguments as for `filter`."""
-        view = self.look(
-            np.asarray(observation)[None], None if hazards is None else np.asarray(hazards)[None]
-        )
+        given = None if hazards is None else np.asarray(hazards)[None]
+        view = self.look(np.asarray(observation)[None], given)
         nominal = scene.check_action(np.asarray(nominal_action)[None], 1)
         step = Step(self._settings, view, nominal, scene.check_memory(None, 1), np.ones(1, np.bool_))
         return Programme(step, np.zeros(1, np.int64), step.active).problem() if step.refused else None

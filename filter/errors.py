@@ -13,11 +13,7 @@ class FilterError(Exception):
 
 
 class FilterInputError(FilterError, ValueError):
-    """An input has a wrong shape or a value that is not finite; the caller decides what the robot does then.
-
-    Attributes:
-        field: name of the argument at fault.
-    """
+    """An input, ``field``, has a wrong shape or value; the caller decides what the robot does then."""
 
     def __init__(self, field: str, problem: str) -> None:
         super().__init__(f"{field}: {problem}")

@@ -136,13 +136,14 @@ def screen(
     certificates: Records,
     certified: BoolArray,
     side: NDArray[np.int8],
+    planned: BoolArray,
     left: NDArray[np.int8],
     plan: FloatArray,
 ) -> int:
     """Look for certificates of the nominal actions (N, 2) where the gate is open; how many have none.
 
     Where ``active`` (N,) is False, the sure backup stands for one. ``certified`` (N,) receives which have
-    one; a remembered ``side`` (N,) fades; ``left`` (N,) and ``plan`` (N, PLAN_STEPS, 2) receive the plans.
+    one; a remembered ``side`` (N,) fades; the last three (N,), (N,), (N, PLAN_STEPS, 2) receive the plans.
     """
     config = settings[0]
     refused = 0
@@ -153,12 +154,13 @@ def screen(
         if active[k]:
             found = certify_one(config, obstacles[k], seen[k].count, state, u1, u2, config.hysteresis)
             one.clearance, one.nearest, one.backup, one.steps = found
-            certified[k] = found[0] >= config.hysteresis
+            certified[k] = planned[k] = found[0] >= config.hysteresis
             refused += not certified[k]
         else:
             sure = seen[k].sure
             one.clearance, one.nearest = sure.clearance, sure.nearest
             one.backup, one.steps = sure.backup, sure.steps
+            planned[k] = sure.clearance >= 0.0
         side[k] -= (side[k] > 0) - (side[k] < 0)
         left[k] = _plan(config, state, u1, u2, one.backup, one.steps, plan[k])
     return refused

@@ -66,6 +66,7 @@ class Step:
             self.certificates,
             self.certified,
             self.memory["side"],
+            self.memory["planned"],
             self.memory["left"],
             self.memory["plan"],
         )
@@ -158,9 +159,8 @@ class Step:
             self._hazard[rows] = hazard
 
     def has_plan(self, rows: IntArray) -> BoolArray:
-        """Which of some rows' robots came with a plan that is not at its end (n,)."""
-        left: BoolArray = self._before["left"][rows] > 0
-        return left
+        """Which of some rows' robots came with a certified plan (n,)."""
+        return np.asarray(self._before["planned"][rows])
 
     def go_on(self, rows: IntArray, reason: str) -> None:
         """Send the next action of some rows' plans."""
@@ -171,6 +171,7 @@ class Step:
 
     def forget(self, rows: IntArray) -> None:
         """Leave some rows without a plan."""
+        self.memory["planned"][rows] = False
         self.memory["left"][rows] = 0
         self._settled(rows)
 
@@ -190,6 +191,7 @@ class Step:
             opened_by = np.where(self.active, opened_by, texts("", n))
         if self._open is not None:
             rows = np.flatnonzero(self._open)
+            memory["planned"][rows] = True
             left, plan = memory["left"], memory["plan"]
             kernel.keep_plans(
                 self.settings, self.scene.seen, rows, self.action, self.certificates, left, plan

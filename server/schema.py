@@ -43,7 +43,7 @@ class MemoryJson(BaseModel):
 
     side: int
     guided: int
-    plan: Annotated[list[Pair], Field(max_length=PLAN_STEPS)]
+    plan: Annotated[list[Pair], Field(max_length=PLAN_STEPS)] | None
 
 
 class ActRequest(BaseModel):
