@@ -56,10 +56,12 @@ def decisions() -> st.SearchStrategy[Decision]:
     action = arrays(np.float64, 2, elements=st.floats(-1.0, 1.0))
     numbers = st.floats(-1e9, 1e9) | st.just(float("nan"))
 
-    def memory(side: int, guided: int, plan: list[np.ndarray]) -> np.void:
+    def memory(side: int, guided: int, plan: list[np.ndarray] | None) -> np.void:
         made = np.zeros(1, MEMORY)
-        made["side"], made["guided"], made["left"] = side, guided, len(plan)
-        made["plan"][0, : len(plan)] = np.reshape(plan, (-1, 2))
+        made["side"], made["guided"] = side, guided
+        if plan is not None:
+            made["planned"], made["left"] = True, len(plan)
+            made["plan"][0, : len(plan)] = np.reshape(plan, (-1, 2))
         return made[0]
 
     return st.builds(
@@ -76,7 +78,10 @@ def decisions() -> st.SearchStrategy[Decision]:
         threshold=numbers,
         opened_by=st.none() | st.sampled_from(OpenedBy),
         memory=st.builds(
-            memory, st.integers(-127, 127), st.integers(0, 1), st.lists(action, max_size=PLAN_STEPS)
+            memory,
+            st.integers(-127, 127),
+            st.integers(-1, 1),
+            st.none() | st.lists(action, max_size=PLAN_STEPS),
         ),
     )
 

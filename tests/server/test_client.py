@@ -121,7 +121,7 @@ def in_turn(*behaviours: Act) -> Act:
 def planned(actions: list[list[float]] = PLAN) -> np.void:
     """A robot's memory that holds a plan."""
     memory = np.zeros(1, MEMORY)
-    memory["side"], memory["left"] = -4, len(actions)
+    memory["side"], memory["planned"], memory["left"] = -4, True, len(actions)
     memory["plan"][0, : len(actions)] = actions
     return memory[0]
 
