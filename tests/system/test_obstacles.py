@@ -2,7 +2,7 @@ import numpy as np
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from filter.obstacles import FAR, gap, gap_segment, least_gap
+from system.obstacles import FAR, gap, gap_segment, least_gap
 
 places = st.floats(-2.0, 2.0)
 cones = st.tuples(places, places, places, places, st.floats(0.05, 0.4), st.floats(-0.04, 0.6))
