@@ -1,4 +1,4 @@
-"""The filter's memory over JSON: the same afterwards, and nothing but what was written is taken."""
+"""The memory over JSON and as a plan: the same afterwards, and nothing but what was written is taken."""
 
 from __future__ import annotations
 
@@ -6,47 +6,95 @@ import json
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from filter import FilterMemory
-from monitor import memory_from_json, memory_to_json
-from monitor.memory import join, take
+from decision import MEMORY, PLAN_STEPS, memory_from_json, memory_to_json, next_of_plan
+
+controls = st.floats(-1.0, 1.0)
 
 
-def test_it_survives_json() -> None:
-    memory = FilterMemory.empty(1)
-    for name in FilterMemory.__dataclass_fields__:
-        getattr(memory, name).fill(1)
-    again = memory_from_json(json.loads(json.dumps(memory_to_json(memory))))
-    assert again is not None
-    for name in FilterMemory.__dataclass_fields__:
-        np.testing.assert_array_equal(getattr(again, name), getattr(memory, name), strict=True)
-    assert memory_to_json(None) is None
-    assert memory_from_json(None) is None
+@st.composite
+def memories(draw: st.DrawFn) -> np.ndarray:
+    """Memories (1,) that a filter can leave."""
+    memory = np.zeros(1, MEMORY)
+    plan = draw(st.lists(st.tuples(controls, controls), max_size=PLAN_STEPS))
+    memory["side"], memory["guided"] = draw(st.integers(-127, 127)), draw(st.integers(0, 1))
+    memory["left"] = len(plan)
+    memory["plan"][0, : len(plan)] = np.array(plan).reshape(-1, 2)
+    return memory
+
+
+@given(memory=memories())
+def test_it_survives_json(memory) -> None:
+    again = memory_from_json(json.loads(json.dumps(memory_to_json(memory[0]), allow_nan=False)))
+    assert again.dtype == MEMORY
+    assert again.tobytes() == memory.tobytes()
+
+
+def good() -> dict:
+    memory = np.zeros(1, MEMORY)
+    memory["left"] = 2
+    memory["plan"][0, :2] = 0.05
+    return memory_to_json(memory[0])
 
 
 @pytest.mark.parametrize(
-    "change",
+    ("change", "named"),
     [
-        lambda m: m.clear(),
-        lambda m: m.update(extra=[0]),
-        lambda m: m.update(side=[]),
-        lambda m: m.update(side=[0, 0]),
-        lambda m: m.update(side=[0.5]),
-        lambda m: m.update(side=[1e300]),
+        (lambda m: m.clear(), "memory has the fields"),
+        (lambda m: m.update(extra=[0]), "extra"),
+        (lambda m: m.pop("side"), "expected guided, plan, side"),
+        (lambda m: m.update(side=[]), r"memory\.side"),
+        (lambda m: m.update(side=0.5), r"memory\.side"),
+        (lambda m: m.update(side=1e300), r"memory\.side"),
+        (lambda m: m.update(side=128), r"memory\.side"),
+        (lambda m: m.update(side=-128), r"memory\.side"),
+        (lambda m: m.update(side=True), r"memory\.side"),
+        (lambda m: m.update(side="left"), r"memory\.side"),
+        (lambda m: m.update(side=None), r"memory\.side"),
+        (lambda m: m.update(guided=-1), r"memory\.guided"),
+        (lambda m: m.update(guided=None), r"memory\.guided"),
+        (lambda m: m.update(plan=None), r"memory\.plan"),
+        (lambda m: m.update(plan="fast"), r"memory\.plan"),
+        (lambda m: m.update(plan=[1.0]), r"memory\.plan"),
+        (lambda m: m.update(plan=[[1.0, 0.0, 0.0]]), r"memory\.plan"),
+        (lambda m: m.update(plan=[[1.5, 0.0]]), r"memory\.plan"),
+        (lambda m: m.update(plan=[[float("nan"), 0.0]]), r"memory\.plan"),
+        (lambda m: m.update(plan=[[None, 0.0]]), r"memory\.plan"),
+        (lambda m: m.update(plan=[[1.0, 0.0]] * (PLAN_STEPS + 1)), r"memory\.plan"),
+        (lambda m: m.update(plan={}), r"memory\.plan"),
+        # No list of pairs, though as many numbers.
+        (lambda m: m.update(plan=[1.0, 0.0]), r"memory\.plan"),
+        (lambda m: m.update(plan=[[1.0, 0.0, 0.5, 0.5]]), r"memory\.plan"),
+        (lambda m: m.update(plan=[[True, False]]), r"memory\.plan"),
+        (lambda m: m.update(plan=[["0.5", "0.5"]]), r"memory\.plan"),
     ],
 )
-def test_what_this_version_did_not_write_is_refused(change) -> None:
-    value = memory_to_json(FilterMemory.empty(1))
-    assert value is not None
+def test_what_this_version_did_not_write_is_refused_and_its_field_named(change, named) -> None:
+    value = good()
     change(value)
-    with pytest.raises(ValueError, match="memory"):
+    with pytest.raises(ValueError, match=named):
         memory_from_json(value)
 
 
-def test_robots_shares_make_the_batch_again() -> None:
-    memory = FilterMemory.empty(5)
-    memory.side[:] = [0, 1, -1, 1, 0]
-    again = join([take(memory, i) for i in range(5)])
-    assert again is not None
-    np.testing.assert_array_equal(again.side, memory.side, strict=True)
-    assert join([take(memory, 0), None]) is None
+@given(memory=memories(), more=st.integers(1, 4))
+def test_the_plan_is_played_action_by_action_and_then_the_robot_coasts(memory, more) -> None:
+    before, plan = memory.copy(), memory["plan"][0, : memory["left"][0]].copy()
+    after = memory
+    for k in range(len(plan) + more):
+        action, after = next_of_plan(after)
+        np.testing.assert_array_equal(action, plan[k : k + 1] if k < len(plan) else [[0.0, 0.0]])
+        assert after["left"][0] == max(len(plan) - k - 1, 0)
+        assert (after["side"] == before["side"]).all()
+        assert (after["guided"] == before["guided"]).all()
+    assert memory.tobytes() == before.tobytes()  # nothing of the caller's is changed
+
+
+def test_each_robot_plays_its_own_plan() -> None:
+    memory = np.zeros(3, MEMORY)
+    memory["left"] = [0, 1, 20]
+    memory["plan"] = 0.03
+    action, after = next_of_plan(memory)
+    np.testing.assert_array_equal(action, [[0.0, 0.0], [0.03, 0.03], [0.03, 0.03]])
+    assert after["left"].tolist() == [0, 0, 19]
