@@ -99,13 +99,19 @@ def least_distance_of_the_plan(
 ) -> FloatArray:
     """Least distance (N,) to hazards (N, n, 2) under the action and then all of what is remembered."""
     least = np.full(len(state), np.inf)
-    for step in range(1 + int(memory["left"].max(initial=0)) + 60):
+    for step in range(1 + int(memory["left"].max(initial=0)) + 10):
         state, way = advance_exactly(state, action)
         gaps = np.linalg.norm(way[:, :, None] - hazards[None], axis=3).min(axis=(0, 2))
         least = np.minimum(least, gaps)
         there = (step < memory["left"])[:, None]
         action = np.where(there, memory["plan"][:, min(step, memory["plan"].shape[1] - 1)], 0.0)
-    return least
+    # It coasts, and no longer turns: along a straight line to the stop point.
+    lever = 1.927e-2 * state[:, 5]
+    motion = state[:, 3:5] + lever[:, None] * np.stack([-np.sin(state[:, 2]), np.cos(state[:, 2])], axis=1)
+    rest = (5.18879e-3 / 0.01 * motion)[:, None]
+    away = hazards - state[:, None, :2]
+    share = np.clip((away * rest).sum(axis=2) / np.maximum((rest**2).sum(axis=2), 1e-12), 0.0, 1.0)
+    return np.minimum(least, np.linalg.norm(away - share[..., None] * rest, axis=2).min(axis=1))
 
 
 def attacker(observation: FloatArray, hazards: FloatArray, rng: np.random.Generator) -> FloatArray:
@@ -242,9 +248,7 @@ def scenes(draw_scene) -> Callable[..., tuple[FloatArray, FloatArray, FloatArray
 
     def many(n: int, seed: int = 0) -> tuple[FloatArray, FloatArray, FloatArray]:
         rng = np.random.default_rng(seed)
-        return tuple(
-            np.array(part) for part in zip(*(draw_scene(rng) for _ in range(n)), strict=True)
-        )
+        return tuple(np.array(part) for part in zip(*(draw_scene(rng) for _ in range(n)), strict=True))
 
     return many
 

@@ -285,7 +285,9 @@ def test_any_solver_gives_the_same_actions(scenes, pressed, name, circulation):
     )
     robot_filter = BarrierFilter(FilterConfig(circulation=circulation))
     ours = robot_filter.filter(observation, action, hazards)
-    theirs = BarrierFilter(FilterConfig(solver=name, circulation=circulation)).filter(observation, action, hazards)
+    theirs = BarrierFilter(FilterConfig(solver=name, circulation=circulation)).filter(
+        observation, action, hazards
+    )
     np.testing.assert_allclose(theirs.action, ours.action, atol=1e-5)
     np.testing.assert_array_equal(theirs.mode, ours.mode)
     np.testing.assert_array_equal(theirs.origin, ours.origin)

@@ -1,6 +1,5 @@
 """The gymnasium wrappers: the filter by hand, in the user's own loop."""
 
-
 import gymnasium
 import numpy as np
 import pytest

@@ -97,7 +97,7 @@ def test_it_ends_when_the_robot_is_past(guided, hand):
     else:
         pytest.fail(f"stuck at {at[:2]}")
     first = led.index(True)
-    assert 0 < first  # not before it was refused
+    assert first > 0  # not before it was refused
     assert not any(led[-15:])
     assert memory["guided"][0] == 0
 
@@ -158,9 +158,7 @@ def test_a_batch_is_led_as_its_robots_alone(guided, hand):
     n = 60
     distance, bearing = rng.uniform(0.3, 1.0, (n, 3)), rng.uniform(-0.8, 0.8, (n, 3))
     hazards = np.stack([distance * np.cos(bearing), distance * np.sin(bearing)], axis=2)
-    observation = np.array(
-        [hand.observe(at, (rng.uniform(0, 0.8), 0.0), 0.0, (1.8, 0.0)) for at in hazards]
-    )
+    observation = np.array([hand.observe(at, (rng.uniform(0, 0.8), 0.0), 0.0, (1.8, 0.0)) for at in hazards])
     action = np.tile([1.0, 0.0], (n, 1))
     memory = np.zeros(n, MEMORY)
     memory["guided"], memory["side"] = rng.integers(0, 2, n), rng.integers(-50, 51, n)

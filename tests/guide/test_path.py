@@ -33,7 +33,9 @@ def test_it_passes_on_the_shorter_side_unless_another_was_chosen():
 
 
 @settings(deadline=None, max_examples=100)
-@given(x=st.floats(0.6, 2.0), y=st.floats(-0.8, 0.8), radius=st.floats(0.1, 0.45), side=st.sampled_from([1, -1]))
+@given(
+    x=st.floats(0.6, 2.0), y=st.floats(-0.8, 0.8), radius=st.floats(0.1, 0.45), side=st.sampled_from([1, -1])
+)
 def test_the_line_to_a_tangent_point_touches_the_disc(x, y, radius, side):
     one = discs((x, y, radius))
     tx, ty = tangent(one, 0, 0.0, 0.0, side)
@@ -59,7 +61,9 @@ def test_the_first_leg_of_a_way_that_was_found_is_free(some):
 
 @settings(deadline=None, max_examples=100)
 @given(
-    some=st.lists(st.tuples(places, st.floats(0.05, 0.4)), max_size=5), x=st.floats(0.2, 3.0), y=st.floats(-1, 1)
+    some=st.lists(st.tuples(places, st.floats(0.05, 0.4)), max_size=5),
+    x=st.floats(0.2, 3.0),
+    y=st.floats(-1, 1),
 )
 def test_the_first_hit_is_the_first_of_all(some, x, y):
     all_discs = discs(*[(cx, cy, r) for (cx, cy), r in some])
@@ -72,4 +76,10 @@ def test_the_first_hit_is_the_first_of_all(some, x, y):
         first = np.linalg.norm(way[inside.any(axis=1).argmax()])
         assert hit >= 0
         assert at <= first + 1e-9
-        assert abs(np.linalg.norm(np.array([x, y]) / np.hypot(x, y) * at - all_discs[hit, :2]) - all_discs[hit, 2]) < 1e-9
+        assert (
+            abs(
+                np.linalg.norm(np.array([x, y]) / np.hypot(x, y) * at - all_discs[hit, :2])
+                - all_discs[hit, 2]
+            )
+            < 1e-9
+        )

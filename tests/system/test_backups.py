@@ -51,9 +51,7 @@ def distance_to_path(point, path):
 
 
 @settings(deadline=None, max_examples=100)
-@given(
-    state=states, heading=st.floats(-np.pi, np.pi), kind=st.integers(0, BACKUPS - 1)
-)
+@given(state=states, heading=st.floats(-np.pi, np.pi), kind=st.integers(0, BACKUPS - 1))
 def test_a_law_gives_actions_within_the_box(state, heading, kind):
     share, turn = law(ROBOT, kind, stopping(ROBOT, state._replace(heading=heading)))
     assert abs(share) <= 1.0

@@ -1,6 +1,7 @@
 """The backups' clearances, and the floor: one step with any action costs no more than `loss` takes off."""
 
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -140,7 +141,7 @@ def by_hand(settings, kind, steps, obstacles, start):
     rest = settings["travel_error"] * (travelled + math.hypot(at.zx - at.x, at.zy - at.y))
     corners = np.array(points)
     way = np.concatenate(
-        [np.linspace(a, b, 2 + int(np.linalg.norm(b - a) / 1e-3)) for a, b in zip(corners, corners[1:])]
+        [np.linspace(a, b, 2 + int(np.linalg.norm(b - a) / 1e-3)) for a, b in pairwise(corners)]
     )
     away = np.linalg.norm(way[:, None] - obstacles[None, :, :2], axis=2).min(axis=0)
     return away - obstacles[:, 4] - rest
@@ -171,7 +172,9 @@ def test_the_clearance_is_the_best_over_the_steps_of_thrust(numbers):
 def test_the_best_backup_is_the_best_and_the_sure_one_pays_for_any_action(numbers):
     for state, obstacles in random_cases(150, seed=2):
         start = stopping(numbers["robot"], state)
-        every = [clearance(numbers, kind, obstacles, 3, start, FAR, -1, True, False) for kind in range(BACKUPS)]
+        every = [
+            clearance(numbers, kind, obstacles, 3, start, FAR, -1, True, False) for kind in range(BACKUPS)
+        ]
         here = np.linalg.norm(obstacles[:, :2], axis=1).min() - 0.21
         value, _, kind, steps = best_backup(numbers, obstacles, 3, start, FAR, False)
         assert value == pytest.approx(min(max(e[0] for e in every), here), abs=1e-8)
