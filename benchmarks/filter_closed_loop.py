@@ -1,16 +1,18 @@
 """The filter in the closed loop: violations and return, by policy, source of the hazards, and what is off.
 
-``python -m benchmarks.filter_closed_loop --episodes 1000 --bundle models/NAME`` prints the tables of
-docs/filter.md. Every episode is a fresh layout; all run side by side in the vector environment, the filter in
-one batch.
+``python -m benchmarks.filter_closed_loop`` runs what docs/filter.md shows, a line after the other, and keeps
+each in a CSV file: lines that are there already are not run again. ``--print`` prints the file as a table.
+Every episode is a fresh layout; all run side by side in the vector environment, the filter in one batch.
 """
 
 from __future__ import annotations
 
+import csv
 import itertools
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,7 +20,9 @@ import numpy as np
 import tyro
 from numpy.typing import NDArray
 
-from filter import BarrierFilter, FilterConfig, FilterMemory
+from decision import MEMORY, Origin
+from filter import BarrierFilter, FilterConfig
+from guide import DEFAULT_STRENGTH, STRENGTHS, Guide, Strength
 from pointgoal import seeds
 from pointgoal.lidar import encode, nearest
 from pointgoal.observation import HAZARD_RADIUS, LIDAR_RANGE, layout
@@ -27,6 +31,8 @@ from pointgoal.seeds import Use
 FloatArray = NDArray[np.float64]
 Policy = Callable[[FloatArray, FloatArray, np.random.Generator], FloatArray]
 """Observation (N, 60) and hazards in the body frame (N, n, 2) -> actions (N, 2)."""
+Source = Literal["given", "lidar"]
+Gate = Literal["always", "floor", "none"]
 EPISODE_STEPS = 1000
 
 
@@ -52,16 +58,37 @@ class Off:
     gaussian: bool = False
 
 
-@dataclass
+@dataclass(frozen=True)
+class Line:
+    """One line of a table: what is run, in what world, behind which filter.
+
+    Attributes:
+        policy: a name of `POLICIES`, or a bundle's folder.
+        world: a name of `WORLDS`.
+        source: where the filter has the hazards from.
+        gate: "always"; "floor" opens it where the barrier is low and never else, as the gate `risk` does if λ
+            says nothing; "none" is no filter.
+        guide: how much the guide may do.
+        memory: whether the filter's memory is carried from step to step.
+    """
+
+    policy: str
+    world: str
+    source: Source
+    gate: Gate
+    guide: Strength
+    memory: bool = True
+
+
+@dataclass(frozen=True)
 class Outcome:
     """What E episodes gave.
 
     Attributes:
         returns: (E,) undiscounted.
-        costs: (E,).
+        costs: (E,) depth.
         violations: (E,) steps with a cost.
-        interventions: share of the steps on which the action was changed.
-        fallbacks: share of the steps on which nothing was certified.
+        shares: of all steps: gate open, by origin, and those on which a certified action was replaced.
         least: least distance of the robot to a hazard's edge [m].
         seconds: wall time of the filter a decision.
     """
@@ -69,8 +96,7 @@ class Outcome:
     returns: FloatArray
     costs: FloatArray
     violations: NDArray[np.int64]
-    interventions: float
-    fallbacks: float
+    shares: dict[str, float]
     least: float
     seconds: float
 
@@ -168,75 +194,60 @@ def _perturbed(
     return observation, shown
 
 
-def run(
-    policy: Policy,
-    robot_filter: BarrierFilter | None,
-    source: Literal["given", "lidar"],
-    episodes: int,
-    level: int = 1,
-    off: Sequence[Off] = (Off(),),
-    seed: int = 0,
-    with_memory: bool = True,
-    chunk: int = 512,
-) -> Outcome:
-    """Run episodes of one policy behind one filter."""
+def run(line: Line, episodes: int, seed: int = 0, chunk: int = 512) -> Outcome:
+    """Run the episodes of one line."""
     rows, rng = seeds.rows(Use.FILTER, seed, episodes), seeds.generator(Use.FILTER, seed)
-    outcomes = [
-        _run(policy, robot_filter, source, rows[i : i + chunk], level, off, rng, with_memory)
-        for i in range(0, episodes, chunk)
-    ]
+    parts = [_run(line, rows[i : i + chunk], rng) for i in range(0, episodes, chunk)]
+    weights = np.array([len(part.returns) for part in parts]) / episodes
+    names = parts[0].shares
     return Outcome(
-        returns=np.concatenate([one.returns for one in outcomes]),
-        costs=np.concatenate([one.costs for one in outcomes]),
-        violations=np.concatenate([one.violations for one in outcomes]),
-        interventions=float(np.mean([one.interventions for one in outcomes])),
-        fallbacks=float(np.mean([one.fallbacks for one in outcomes])),
-        least=min(one.least for one in outcomes),
-        seconds=float(np.mean([one.seconds for one in outcomes])),
+        returns=np.concatenate([part.returns for part in parts]),
+        costs=np.concatenate([part.costs for part in parts]),
+        violations=np.concatenate([part.violations for part in parts]),
+        shares={name: float(weights @ [part.shares[name] for part in parts]) for name in names},
+        least=min(part.least for part in parts),
+        seconds=float(weights @ [part.seconds for part in parts]),
     )
 
 
-def _run(
-    policy: Policy,
-    robot_filter: BarrierFilter | None,
-    source: str,
-    rows: list[int],
-    level: int,
-    off: Sequence[Off],
-    rng: np.random.Generator,
-    with_memory: bool,
-) -> Outcome:
+def _run(line: Line, rows: list[int], rng: np.random.Generator) -> Outcome:
     n = len(rows)
-    env = make_environments(level, n, off)
+    world = WORLDS[line.world]
+    policy = POLICIES[line.policy] if line.policy in POLICIES else bundle_policy(Path(line.policy))
+    robot_filter = BarrierFilter(world.config, Guide(world.config, line.guide))
+    env = make_environments(world.level, n, world.off)
     observation, _ = env.reset(seed=rows)
     returns, costs = np.zeros(n), np.zeros(n)
     violations = np.zeros(n, dtype=np.int64)
     alive = np.ones(n, dtype=bool)
-    changed = fallen = 0
+    counts: Counter[str] = Counter()
     least = np.inf
     spent = 0.0
-    memory = FilterMemory.empty(n)
-    noisy = off[0].distance + off[0].bearing + off[0].speed > 0.0
+    memory = np.zeros(n, MEMORY)
+    off = world.off[0]
+    noisy = off.distance + off.bearing + off.speed > 0.0
     for _ in range(EPISODE_STEPS):
         hazards = env.hazards_in_body_frame()
-        seen, shown = _perturbed(observation, hazards, off[0], rng) if noisy else (observation, hazards)
-        action = policy(seen, shown, rng)
-        if robot_filter is not None:
+        seen, shown = _perturbed(observation, hazards, off, rng) if noisy else (observation, hazards)
+        action = np.clip(policy(seen, shown, rng), -1.0, 1.0)
+        if line.gate != "none":
             start = time.perf_counter()
-            result = robot_filter.filter(
-                seen, action, shown if source == "given" else None, memory if with_memory else None
-            )
+            view = robot_filter.look(seen, shown if line.source == "given" else None)
+            active = np.ones(n, bool) if line.gate == "always" else view.low
+            decided = robot_filter.decide(view, action, memory, active)
             spent += time.perf_counter() - start
-            memory = result.memory
-            action = result.action
-            changed += int((result.mode[alive] > 0).sum())
-            fallen += int((result.mode[alive] == 2).sum())
+            action = decided.action
+            if line.memory:
+                memory = decided.memory
+            counts["open"] += int((decided.gate_open & alive).sum())
+            counts["replaced"] += int((decided.certified & (decided.origin != "") & alive).sum())
+            counts.update(dict(zip(*np.unique(decided.origin[alive], return_counts=True), strict=True)))
         observation, reward, terminated, truncated, info = env.step(action)
         returns[alive] += reward[alive]
         costs[alive] += info["cost"][alive]
         edge = _nearest_edge(observation, info)
         # At level 2 vases cost as well, and a step with a cost need not be one in a hazard.
-        inside = edge < 0.0 if level == 2 else info["cost"] > 0.0
+        inside = edge < 0.0 if world.level == 2 else info["cost"] > 0.0
         violations[alive] += inside[alive]
         least = min(least, float(edge[alive].min(initial=np.inf)))
         alive &= ~(terminated | truncated)
@@ -244,7 +255,8 @@ def _run(
             break
     env.close()
     steps = n * EPISODE_STEPS
-    return Outcome(returns, costs, violations, changed / steps, fallen / steps, least, spent / steps)
+    shares = {name: counts[name] / steps for name in SHARES}
+    return Outcome(returns, costs, violations, shares, least, spent / steps)
 
 
 def _nearest_edge(observation: FloatArray, info: dict[str, Any]) -> FloatArray:
@@ -267,37 +279,60 @@ POLICIES: dict[str, Policy] = {
     "attacker": attacker_policy,
     "seeker": seeker_policy,
 }
-SOURCES: tuple[Literal["given", "lidar"], ...] = ("given", "lidar")
-PLAIN = FilterConfig()
+SHARES = ("open", *(origin.value for origin in Origin), "replaced")
+"""What is counted of the steps."""
+
+
+@dataclass(frozen=True)
+class World:
+    """Where a line is run: the level, what is off, and the filter that is ready for it."""
+
+    config: FilterConfig = field(default_factory=FilterConfig)
+    level: int = 1
+    off: tuple[Off, ...] = (Off(),)
+
+
 ROBUST = FilterConfig(travel_error=0.3)
 """For mass, drag, thrust and turning that are 10 % off: docs/filter.md derives the number."""
-NOISY = FilterConfig(position_error=0.002, bearing_error=np.radians(2.0), travel_error=0.03)
+NOISY = FilterConfig(position_error=0.002, bearing_error=float(np.radians(2.0)), travel_error=0.03)
 """For errors of up to 2 mm, 2 degrees and 2 %."""
-COMBINATIONS = [
+COMBINATIONS = tuple(
     Off(mass, drag, thrust, turning)
     for mass, drag, thrust, turning in itertools.product((0.9, 1.1), repeat=4)
-]
-NOISE = [Off(distance=0.002, bearing=float(np.radians(2.0)), speed=0.02)]
-
-
-def _line(name: str, outcome: Outcome) -> str:
-    returns = outcome.returns
-    return (
-        f"{name:34s} {returns.mean():7.2f} {np.percentile(returns, 10):7.2f} {outcome.costs.mean():7.3f} "
-        f"{outcome.violations.sum():6d} {(outcome.violations > 0).sum():5d} {outcome.interventions:7.3f} "
-        f"{outcome.fallbacks:8.4f} {1000 * outcome.least:8.1f} {1e6 * outcome.seconds:7.1f}"
-    )
-
-
-Table = Literal["plain", "memoryless", "off", "noise", "margin", "level2", "level0"]
-MARGINS = {
-    "margin 3 mm": FilterConfig(margin=0.003),
-    "margin 2 cm": FilterConfig(margin=0.02),
-    "margin 4 cm": FilterConfig(margin=0.04),
-    "ready for noise": NOISY,
-    "ready for a robot off": ROBUST,
+)
+NOISE = (Off(distance=0.002, bearing=float(np.radians(2.0)), speed=0.02),)
+WORLDS = {
+    "plain": World(),
+    "off": World(ROBUST, off=COMBINATIONS),
+    "noise": World(NOISY, off=NOISE),
+    "level 2": World(level=2),
+    "level 0": World(level=0),
+    "margin 3 mm": World(FilterConfig(margin=0.003)),
+    "margin 2 cm": World(FilterConfig(margin=0.02)),
+    "margin 4 cm": World(FilterConfig(margin=0.04)),
+    "ready for noise": World(NOISY),
+    "ready for a robot off": World(ROBUST),
 }
-"""What is asked of the filter though nothing is off: how the return pays for it."""
+SHIPPED, REWARD_ONLY = "models/pointgoal1", "models/ppo1"
+SOURCES: tuple[Source, ...] = ("given", "lidar")
+
+
+def lines() -> Iterator[Line]:
+    """What docs/filter.md shows."""
+    policies = (REWARD_ONLY, SHIPPED, "random", "thrust", "attacker")
+    for policy in policies:
+        yield Line(policy, "plain", "given", "none", "off")
+    for gate, world in itertools.product(("always", "floor"), ("plain", "off", "noise", "level 2")):
+        for policy, source in itertools.product(policies, SOURCES):
+            if policy != SHIPPED or world == "plain":
+                yield Line(policy, world, source, gate, DEFAULT_STRENGTH)  # type: ignore[arg-type]
+    for policy, source, strength in itertools.product((SHIPPED, REWARD_ONLY), SOURCES, STRENGTHS):
+        if strength != DEFAULT_STRENGTH:
+            yield Line(policy, "plain", source, "always", strength)
+    for policy, source in itertools.product((REWARD_ONLY, "attacker"), SOURCES):
+        yield Line(policy, "plain", source, "always", DEFAULT_STRENGTH, memory=False)
+    for world, source in itertools.product(list(WORLDS)[5:], SOURCES):
+        yield Line(REWARD_ONLY, world, source, "always", DEFAULT_STRENGTH)
 
 
 @dataclass
@@ -306,92 +341,79 @@ class Arguments:
 
     episodes: int = 1000
     """Episodes of each line."""
-    bundle: Path | None = None
-    """Bundle of a reward-only policy; without one, a goal seeker by hand stands in for it."""
-    policies: tuple[str, ...] = ("policy", "random", "thrust", "attacker")
-    """Which policies to run."""
-    sources: tuple[Literal["given", "lidar"], ...] = SOURCES
-    """Where the filter has the hazards from."""
-    tables: tuple[Table, ...] = ("plain", "memoryless", "off", "noise", "margin", "level2", "level0")
-    """Which tables to print."""
+    out: Path = Path("benchmarks/results/filter.csv")
+    """Where the lines are kept."""
+    part: tuple[int, int] = (0, 1)
+    """Run the lines i, i + n, i + 2 n ...: one process of several, each with an ``out`` of its own."""
     seed: int = 0
     """Seed of the episodes' layouts and of what is random in them; tune on others."""
+    print: bool = False
+    """Print the tables of what is kept instead."""
 
 
-@dataclass(frozen=True)
-class Line:
-    """One line of a table: what is run, in what world, behind which filter."""
-
-    name: str
-    policy: Policy
-    config: FilterConfig | None
-    source: Literal["given", "lidar"]
-    level: int = 1
-    off: Sequence[Off] = (Off(),)
-    memory: bool = True
-
-
-def _plain(policies: dict[str, Policy], sources: Sequence[Literal["given", "lidar"]]) -> Iterator[Line]:
-    for name, policy in policies.items():
-        yield Line(f"{name}, no filter", policy, None, "given")
-        for source in sources:
-            yield Line(f"{name}, {source}", policy, PLAIN, source)
+def _row(line: Line, outcome: Outcome) -> dict[str, str]:
+    """One line of the CSV file."""
+    return {
+        **{name: str(value) for name, value in asdict(line).items()},
+        "episodes": str(len(outcome.returns)),
+        "return": f"{outcome.returns.mean():.2f}",
+        "p10": f"{np.percentile(outcome.returns, 10):.2f}",
+        "cost": f"{outcome.costs.mean():.4f}",
+        "violating_steps": str(outcome.violations.sum()),
+        "violating_episodes": str((outcome.violations > 0).sum()),
+        "least_mm": f"{1000 * outcome.least:.1f}",
+        **{name: f"{share:.5f}" for name, share in outcome.shares.items()},
+        "us": f"{1e6 * outcome.seconds:.1f}",
+    }
 
 
-def _table(
-    table: Table, policies: dict[str, Policy], sources: Sequence[Literal["given", "lidar"]]
-) -> Iterator[Line]:
-    """The lines of one table."""
-    if table == "plain":
-        yield from _plain(policies, sources)
-        return
-    if table == "level0":
-        # No hazards: policies that look for them, or were trained to see them, have nothing to go by.
-        for name in ("seeker", "random"):
-            yield Line(f"{name}, no filter, level0", POLICIES[name], None, "given", level=0)
-            yield Line(f"{name}, level0", POLICIES[name], PLAIN, "given", level=0)
-        return
-    if table == "margin":
-        first = next(iter(policies))
-        for source, (title, config) in itertools.product(sources, MARGINS.items()):
-            yield Line(f"{first}, {source}, {title}", policies[first], config, source)
-        return
-    for (name, policy), source in itertools.product(policies.items(), sources):
-        title = f"{name}, {source}, {table}"
-        if table == "memoryless":
-            yield Line(title, policy, PLAIN, source, memory=False)
-        elif table == "off":
-            yield Line(title, policy, ROBUST, source, off=COMBINATIONS)
-        elif table == "noise":
-            yield Line(title, policy, NOISY, source, off=NOISE)
-        else:
-            yield Line(title, policy, PLAIN, source, level=2)
+def _kept(path: Path) -> list[dict[str, str]]:
+    if not path.exists():
+        return []
+    with path.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def _keep(path: Path, row: dict[str, str]) -> None:
+    new = not path.exists()
+    with path.open("a", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(row))
+        if new:
+            writer.writeheader()
+        writer.writerow(row)
+
+
+def table(rows: list[dict[str, str]]) -> str:
+    """The lines as Markdown: what the robot did, and what the filter did of its steps."""
+    head = ("policy", "world", "hazards", "gate", "guide", "return", "p10", "violating steps", "least [mm]")
+    shares = ("open", "QP", "search", "plan", "least harm", "guide", "replaced")
+    lines = [f"| {' | '.join((*head, *shares))} |", "|---" * (len(head) + len(shares)) + "|"]
+    for row in rows:
+        percent = {name: 100 * float(row[name]) for name in SHARES}
+        percent["QP"] = percent["barrier"] + percent["circulation"]
+        world = row["world"] + ("" if row["memory"] == "True" else ", no memory")
+        names = (Path(row["policy"]).name, world, row["source"], row["gate"], row["guide"])
+        figures = (row["return"], row["p10"], row["violating_steps"], row["least_mm"])
+        lines.append(f"| {' | '.join((*names, *figures, *(f'{percent[name]:.2f}' for name in shares)))} |")
+    return "\n".join(lines)
 
 
 def main() -> None:
-    """Print the tables."""
+    """Run the lines that are not kept yet, or print those that are."""
     arguments = tyro.cli(Arguments)
-    seeker = seeker_policy if arguments.bundle is None else bundle_policy(arguments.bundle)
-    known = {**POLICIES, "policy": seeker}
-    policies = {name: known[name] for name in arguments.policies}
-    print(
-        f"{'':34s} {'return':>7s} {'10th':>7s} {'cost':>7s} {'viol.':>6s} {'eps.':>5s} {'changed':>7s} "
-        f"{'fallback':>8s} {'least mm':>8s} {'us':>7s}"
-    )
-    for table in arguments.tables:
-        for line in _table(table, policies, arguments.sources):
-            robot_filter = None if line.config is None else BarrierFilter(line.config)
-            outcome = run(
-                line.policy,
-                robot_filter,
-                line.source,
-                arguments.episodes,
-                line.level,
-                line.off,
-                arguments.seed,
-                with_memory=line.memory,
-            )
-            print(_line(line.name, outcome), flush=True)
+    if arguments.print:
+        print(table(_kept(arguments.out)))
+        return
+    first, step = arguments.part
+    for line in list(lines())[first::step]:
+        asked = {name: str(value) for name, value in asdict(line).items()} | {
+            "episodes": str(arguments.episodes)
+        }
+        if any(all(row[name] == value for name, value in asked.items()) for row in _kept(arguments.out)):
+            continue
+        row = _row(line, run(line, arguments.episodes, arguments.seed))
+        _keep(arguments.out, row)
+        print(" ".join(row.values()), flush=True)
 
 
 if __name__ == "__main__":

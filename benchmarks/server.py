@@ -27,9 +27,10 @@ from pydantic import BaseModel
 from rich.console import Console
 from rich.table import Table
 
+from decision import PLAN_STEPS
 from evaluation.service import Service
 from models import Bundle
-from monitor import Gate
+from monitor import GateName
 from pointgoal.observation import layout
 from server.serve import listen
 
@@ -46,7 +47,7 @@ class ServerBenchmark:
 
     bundle: Annotated[Path, tyro.conf.Positional]
     """The bundle's folder."""
-    gate: Gate = "always"
+    gate: GateName = "always"
     """When the filter is active."""
     requests: int = 2000
     """Requests a round and connection."""
@@ -139,6 +140,8 @@ def run(config: ServerBenchmark) -> dict[str, dict[str, float]]:
         "observation": observation,
         "hazards": [[1.0 + 0.2 * k, 0.3 * k] for k in range(8)],
     }
+    plan = [[0.05, 0.5]] * PLAN_STEPS
+    driving = given | {"request": 1, "memory": {"side": 5, "guided": 0, "plan": plan}}
     with ExitStack() as stack:
         service = stack.enter_context(Service.start(config.bundle, config.gate))
         echo = stack.enter_context(Service.run([sys.executable, "-m", "benchmarks.server", "--echo"]))
@@ -147,6 +150,7 @@ def run(config: ServerBenchmark) -> dict[str, dict[str, float]]:
                 "bare FastAPI echo": (f"{echo.url}/echo", plain),
                 "POST /act, lidar": (f"{service.url}/act", plain),
                 "POST /act, 8 hazards": (f"{service.url}/act", json.dumps(given).encode()),
+                "POST /act, 8 hazards, a full memory": (f"{service.url}/act", json.dumps(driving).encode()),
             },
             config,
         )

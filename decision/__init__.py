@@ -4,20 +4,29 @@ Every room speaks these types: the filter fills them, the monitor adds the risk 
 service sends one row of them, its client gives that row back, and the evaluation counts them.
 """
 
-from decision.decision import SAFE_ACTION, Decision, Decisions, Mode, OpenedBy, Origin
+from decision.decider import BatchDecider, Decider
+from decision.decision import SAFE_ACTION, Decision, Decisions, Mode, OpenedBy, Origin, texts, unknown
+from decision.fallback import fall_back
+from decision.faults import Faults
 from decision.memory import MEMORY, PLAN_STEPS, Memory, memory_from_json, memory_to_json, next_of_plan
 
 __all__ = [
     "MEMORY",
     "PLAN_STEPS",
     "SAFE_ACTION",
+    "BatchDecider",
+    "Decider",
     "Decision",
     "Decisions",
+    "Faults",
     "Memory",
     "Mode",
     "OpenedBy",
     "Origin",
+    "fall_back",
     "memory_from_json",
     "memory_to_json",
     "next_of_plan",
+    "texts",
+    "unknown",
 ]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from enum import StrEnum
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +15,25 @@ from decision.memory import Memory
 FloatArray = NDArray[np.float64]
 TextArray = NDArray[np.str_]
 
+
+@lru_cache(maxsize=64)
+def texts(text: str, n: int) -> TextArray:
+    """The same text n times, wide enough for any of `Mode`, `Origin` and `OpenedBy`; not to be written to."""
+    made = np.full(n, text, dtype="<U11")
+    made.setflags(write=False)
+    return made
+
+
 SAFE_ACTION = (0.0, 0.0)
 """Zero thrust, no turn: what to send when nothing is known."""
+
+
+@lru_cache(maxsize=64)
+def unknown(n: int) -> FloatArray:
+    """NaN n times; not to be written to."""
+    made = np.full(n, np.nan)
+    made.setflags(write=False)
+    return made
 
 
 class Mode(StrEnum):
@@ -59,6 +77,11 @@ class OpenedBy(StrEnum):
     """The barrier is below the floor, and the risk score is not above the threshold."""
     FAULT = "fault"
     """Something failed."""
+
+
+_MODES = {mode.value: mode for mode in Mode}
+_ORIGINS = {"": None} | {origin.value: origin for origin in Origin}
+_OPENED_BY = {"": None} | {cause.value: cause for cause in OpenedBy}
 
 
 @dataclass(frozen=True)
@@ -142,20 +165,39 @@ class Decisions:
 
     def __getitem__(self, index: int) -> Decision:
         """The decision of one robot."""
-        origin, opened_by, hazard = self.origin[index], self.opened_by[index], int(self.hazard[index])
+        hazard = self.hazard.item(index)
         return Decision(
             action=self.action[index],
             nominal_action=self.nominal_action[index],
-            mode=Mode(self.mode[index]),
-            origin=Origin(origin) if origin else None,
-            certified=bool(self.certified[index]),
-            barrier=float(self.barrier[index]),
+            mode=_MODES[self.mode.item(index)],
+            origin=_ORIGINS[self.origin.item(index)],
+            certified=self.certified.item(index),
+            barrier=self.barrier.item(index),
             hazard=hazard if hazard >= 0 else None,
             reason=self.reason[index],
-            risk=float(self.risk[index]),
+            risk=self.risk.item(index),
             threshold=self.threshold,
-            opened_by=OpenedBy(opened_by) if opened_by else None,
+            opened_by=_OPENED_BY[self.opened_by.item(index)],
             memory=self.memory[index],
+        )
+
+    def told(
+        self, nominal_action: FloatArray, risk: FloatArray, threshold: float, opened_by: TextArray
+    ) -> Decisions:
+        """These decisions, with what the policy asked for and what the gate says."""
+        return Decisions(
+            self.action,
+            nominal_action,
+            self.mode,
+            self.origin,
+            self.certified,
+            self.barrier,
+            self.hazard,
+            self.reason,
+            risk,
+            threshold,
+            opened_by,
+            self.memory,
         )
 
     @property

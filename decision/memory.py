@@ -16,7 +16,7 @@ MEMORY = np.dtype([("side", "i1"), ("guided", "i1"), ("left", "i1"), ("plan", "f
 
 - ``side``: the side on which the robot passes what is in its way, 1 left, -1 right, 0 none, times the steps
   for which that is still remembered.
-- ``guided``: whether the guide leads: 1 or 0.
+- ``guided``: the side on which the guide is leading the robot past something, 1 left, -1 right, else 0.
 - ``left``: how many actions of the plan are left.
 - ``plan``: (PLAN_STEPS, 2) what is left of the certified backup, action by action; after it the robot coasts.
 """
@@ -54,10 +54,10 @@ def memory_from_json(value: Mapping[str, Any]) -> Memory:
     memory = np.zeros(1, MEMORY)
     if set(value) != {"side", "guided", "plan"}:
         raise ValueError(f"memory has the fields {sorted(value)}, expected guided, plan, side")
-    for name, least in (("side", -127), ("guided", 0)):
+    for name, least in (("side", -127), ("guided", -1)):
         number = value[name]
-        if isinstance(number, bool) or not isinstance(number, int) or not least <= number <= 127:
-            raise ValueError(f"memory.{name} must be a whole number in {least}..127, got {number!r}")
+        if isinstance(number, bool) or not isinstance(number, int) or not least <= number <= -least:
+            raise ValueError(f"memory.{name} must be a whole number in {least}..{-least}, got {number!r}")
         memory[name] = number
     try:
         plan = np.asarray(value["plan"], dtype=np.float64).reshape(-1, 2)

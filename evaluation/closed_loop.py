@@ -1,43 +1,62 @@
-"""Episodes in simulation, many side by side, with a decider in the loop."""
+"""Episodes in simulation, many side by side, with whatever decides in the loop."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Any, Literal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from dataclasses import dataclass, fields
+from typing import Any, Literal, Protocol
 
 import gymnasium
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from evaluation.deciders import Decided, Decider, FloatArray
-from filter import Mode
+from decision import MEMORY, Decision, Decisions, Memory, Mode, OpenedBy, Origin
 from pointgoal import seeds
+from pointgoal.loop import SIDE_BY_SIDE, Step, drive, groups, side_by_side
 from pointgoal.seeds import Use
 from pointgoal.vector import PointGoalVectorEnv
 
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+TextArray = NDArray[np.str_]
+
 HazardSource = Literal["given", "lidar"]
 """What the filter knows of the hazards: their centres in the body frame, or the lidar alone."""
-SIDE_BY_SIDE = 100
-"""Most robots simulated at once."""
 _TIMED_STATES = 1000
-"""States of the episodes on which a decision is timed."""
+"""States of the episodes on which a decision is timed, at most."""
 
 
 class TaskError(ValueError):
     """A task that is not there, or not one of point robots."""
 
 
+class Decides(Protocol):
+    """What decides: `monitor.Monitor` in this process, `server.Fleet` through a service."""
+
+    def decide(
+        self, observation: ArrayLike, hazards: ArrayLike | None = None, memory: Memory | np.void | None = None
+    ) -> Decision:
+        """Decides for one robot: observation (O,), hazards (n, 2) [m] or None, its memory."""
+
+    def decide_batch(
+        self, observation: ArrayLike, hazards: ArrayLike | None = None, memory: Memory | None = None
+    ) -> Decisions:
+        """Decides for N robots: observation (N, O), hazards (N, n, 2) [m] or None, their memory (N,)."""
+
+
 @dataclass(frozen=True)
 class Trajectory:
-    """What the robots did, [T, E] for T steps of E episodes; rows after an episode's end hold NaN.
+    """What E robots did, T steps long; after an episode's end numbers are NaN, texts empty.
 
     Attributes:
         pose: [T, E, 3] x, y [m] and heading [rad] before the step.
         goal: [T, E, 2] the goal then [m].
         action: [T, E, 2] what was sent.
         risk: [T, E] the risk score λ_ξ(s).
-        mode: [T, E] of `filter.Mode`, NaN after the end.
+        mode: [T, E] texts of `Mode`.
+        opened_by: [T, E] texts of `OpenedBy`, "" where the gate was closed.
         barrier: [T, E] h [m].
         cost: [T, E] the step's cost.
         reward: [T, E] the step's reward.
@@ -48,7 +67,8 @@ class Trajectory:
     goal: FloatArray
     action: FloatArray
     risk: FloatArray
-    mode: FloatArray
+    mode: TextArray
+    opened_by: TextArray
     barrier: FloatArray
     cost: FloatArray
     reward: FloatArray
@@ -57,35 +77,52 @@ class Trajectory:
 
 @dataclass(frozen=True)
 class Episodes:
-    """E finished episodes.
+    """E finished episodes; what is counted is counted for each of them, [E].
 
     Attributes:
-        returns: [E] sums of rewards.
-        costs: [E] sums of costs.
-        violating_steps: [E] steps with a cost above 0.
-        steps: [E] lengths.
-        modes: [E, 3] steps in each of `filter.Mode`.
-        seconds: decision times of one robot [s].
+        returns: sums of rewards.
+        costs: sums of costs: the depth cost, metres inside hazards.
+        violating_steps: steps with a cost above 0: the indicator cost.
+        steps: lengths.
+        modes: mode → steps in it.
+        origins: origin → steps on which the action sent was not the nominal one and came from there.
+        opened_by: cause → steps on which it opened the gate; those of the barrier are its alone, for there
+            the risk score was not above the threshold.
+        certified_replaced: steps on which another action was sent though the nominal one had a certificate.
+        seconds: decision times of one robot [s], see `timed`.
         reasons: why, once for each fallback.
         trajectory: what they did, if it was recorded.
     """
 
     returns: FloatArray
     costs: FloatArray
-    violating_steps: NDArray[np.int64]
-    steps: NDArray[np.int64]
-    modes: NDArray[np.int64]
+    violating_steps: IntArray
+    steps: IntArray
+    modes: dict[Mode, IntArray]
+    origins: dict[Origin, IntArray]
+    opened_by: dict[OpenedBy, IntArray]
+    certified_replaced: IntArray
     seconds: list[float]
     reasons: list[str]
     trajectory: Trajectory | None = None
 
+    @property
+    def open_steps(self) -> IntArray:
+        """[E] steps with the gate open."""
+        return np.asarray(np.sum(list(self.opened_by.values()), axis=0))
+
+    @property
+    def interventions(self) -> IntArray:
+        """[E] steps on which the action sent was not the nominal one."""
+        return self.steps - self.modes[Mode.NOMINAL]
+
 
 def run_episodes(
     task: str,
-    decider: Decider,
+    decider: Decides,
     episodes: int,
     seed: int = 0,
-    hazards: HazardSource = "given",
+    hazards: HazardSource = "lidar",
     record: bool = False,
     progress: Callable[[int], None] | None = None,
     use: Use = Use.EVALUATION,
@@ -94,12 +131,12 @@ def run_episodes(
 
     Args:
         task: gymnasium id of the task.
-        decider: who decides.
+        decider: what decides.
         episodes: how many, at least 1.
         seed: of the layouts; another one has none of them in common.
         hazards: what the filter knows of the hazards.
         record: whether to keep the trajectory; then all of them must fit side by side.
-        progress: called with the count of steps that all robots made since the last call.
+        progress: called with the count of steps that were made since the last call.
         use: what for; together with the seed it says which layouts.
 
     Raises:
@@ -111,49 +148,46 @@ def run_episodes(
     if record and episodes > SIDE_BY_SIDE:
         raise ValueError(f"at most {SIDE_BY_SIDE} episodes can be recorded, got {episodes}")
     rows, rng = seeds.rows(use, seed, episodes), seeds.generator(use, seed)
-    parts = [
-        _run(task, decider, rows[first : first + SIDE_BY_SIDE], rng, hazards, record, progress)
-        for first in range(0, episodes, SIDE_BY_SIDE)
-    ]
-    return Episodes(
-        returns=np.concatenate([part.returns for part in parts]),
-        costs=np.concatenate([part.costs for part in parts]),
-        violating_steps=np.concatenate([part.violating_steps for part in parts]),
-        steps=np.concatenate([part.steps for part in parts]),
-        modes=np.concatenate([part.modes for part in parts]),
-        seconds=[second for part in parts for second in part.seconds],
-        reasons=[reason for part in parts for reason in part.reasons],
-        trajectory=parts[0].trajectory,
-    )
+    tally, recording = _Tally(episodes), _Recording() if record else None
+    states: list[_State] = []
+    size = side_by_side(episodes, SIDE_BY_SIDE)
+    with closing(_make(task, size)) as env:
+        for part in groups(episodes, size):
+            robots = _Robots(decider, hazards, size, recording)
+            for step in drive(env, robots.act, rows[part]):
+                live = np.flatnonzero(step.running)
+                tally.add(part.start + live, live, step, robots.decisions)
+                states.append(robots.state(step.observation, int(rng.choice(live))))
+                if recording is not None:
+                    recording.after(step)
+                if progress is not None:
+                    progress(len(live))
+    chosen = rng.choice(len(states), min(len(states), _TIMED_STATES), replace=False)
+    tally.seconds = list(timed(decider, (states[i] for i in chosen)))
+    return tally.episodes(None if recording is None else recording.trajectory())
 
 
-def _run(
-    task: str,
-    decider: Decider,
-    rows: list[int],
-    rng: np.random.Generator,
-    hazards: HazardSource,
-    record: bool,
-    progress: Callable[[int], None] | None,
-) -> Episodes:
-    count = len(rows)
-    env = _make(task, count)
-    try:
-        tally = _Tally(env, count, record, rng)
-        decider.start(count)
-        observation, _ = env.reset(seed=rows)
-        while tally.running.any():
-            given = env.hazards_in_body_frame() if hazards == "given" else None
-            decided = decider.decide(observation, given)
-            tally.before(observation, given, decided)
-            observation, reward, terminated, truncated, info = env.step(decided.action)
-            tally.after(reward, info["cost"], terminated | truncated)
-            if progress is not None:
-                progress(count)
-        seconds = decider.seconds(*tally.timed_states())
-        return replace(tally.episodes(), seconds=seconds)
-    finally:
-        env.close()
+@dataclass(frozen=True)
+class _State:
+    """What one robot decided on: observation (O,), hazards (n, 2) or None, memory."""
+
+    observation: FloatArray
+    hazards: FloatArray | None
+    memory: np.void
+
+
+def timed(decider: Decides, states: Iterator[_State]) -> Iterator[float]:
+    """How long a decision takes [s]: `decide` as one robot calls it, on one state after the other.
+
+    The first state is decided once before, untimed: a connection may have to be opened. Through a service
+    this is the whole round trip.
+    """
+    for i, state in enumerate(states):
+        if i == 0:
+            decider.decide(state.observation, state.hazards, state.memory)
+        started = time.perf_counter()
+        decider.decide(state.observation, state.hazards, state.memory)
+        yield time.perf_counter() - started
 
 
 def _make(task: str, count: int) -> PointGoalVectorEnv:
@@ -166,83 +200,113 @@ def _make(task: str, count: int) -> PointGoalVectorEnv:
     return env
 
 
-class _Tally:
-    """Adds up what happens to robots whose episode is still running."""
+class _Robots:
+    """N robots from their episodes' starts on: asks what decides, and carries the memory."""
 
-    def __init__(self, env: PointGoalVectorEnv, count: int, record: bool, rng: np.random.Generator) -> None:
-        self.running = np.ones(count, np.bool_)
-        self._env = env
-        self._rng = rng
-        self._sums = np.zeros((count, 2))
-        self._counts = np.zeros((count, 2), np.int64)
-        self._modes = np.zeros((count, len(Mode)), np.int64)
-        self._reasons: list[str] = []
-        self._states: list[tuple[FloatArray, FloatArray | None]] = []
-        self._record: list[FloatArray] | None = [] if record else None
+    decisions: Decisions
+
+    def __init__(
+        self, decider: Decides, source: HazardSource, count: int, recording: _Recording | None
+    ) -> None:
+        self._decider = decider
+        self._source = source
+        self._recording = recording
         self._hazards: FloatArray | None = None
+        self._before: Memory = np.zeros(count, MEMORY)
+        self._memory = self._before
 
-    def before(self, observation: FloatArray, given: FloatArray | None, decided: Decided) -> None:
-        """Notes the state in which the robots decided, and what."""
-        rows = np.arange(len(self.running))
-        self._modes[rows, decided.mode] += self.running
-        for i in np.flatnonzero((decided.mode == Mode.FALLBACK) & self.running):
-            self._reasons.append(decided.reason[i] or "unknown")
-        chosen = self._rng.choice(np.flatnonzero(self.running))
-        self._states.append((observation[chosen].copy(), None if given is None else given[chosen].copy()))
-        if self._record is not None:
-            if self._hazards is None:
-                self._hazards = self._env.hazards.copy()
-            columns: list[NDArray[Any]] = [
-                self._env.pose,
-                self._env.goal,
-                decided.action,
-                decided.risk,
-                decided.mode,
-                decided.barrier,
-            ]
-            self._record.append(np.column_stack(columns).astype(np.float64))
+    def act(self, observation: FloatArray, env: Any) -> FloatArray:
+        self._hazards = env.hazards_in_body_frame() if self._source == "given" else None
+        self._before = self._memory
+        self.decisions = self._decider.decide_batch(observation, self._hazards, self._before)
+        self._memory = self.decisions.memory
+        if self._recording is not None:
+            self._recording.before(env, self.decisions)
+        return self.decisions.action
 
-    def after(self, reward: FloatArray, cost: FloatArray, done: NDArray[np.bool_]) -> None:
-        """Adds a step's reward and cost, and ends the episodes that are done."""
-        self._sums += np.column_stack([reward, cost]) * self.running[:, None]
-        self._counts += np.column_stack([cost > 0.0, np.ones_like(done)]) & self.running[:, None]
-        if self._record is not None:
-            row = np.column_stack([self._record[-1], cost, reward])
-            row[~self.running] = np.nan
-            self._record[-1] = row
-        self.running &= ~done
+    def state(self, observation: FloatArray, robot: int) -> _State:
+        """What a robot decided on in the last step."""
+        hazards = None if self._hazards is None else self._hazards[robot].copy()
+        return _State(observation[robot].copy(), hazards, self._before[robot].copy())
 
-    def timed_states(self) -> tuple[FloatArray, FloatArray | None]:
-        """States that the robots were in: observations [K, O] and hazards [K, n, 2] or None."""
-        states = self._states[:_TIMED_STATES]
-        hazards = [given for _, given in states if given is not None]
-        return np.array([observation for observation, _ in states]), np.array(hazards) if hazards else None
 
-    def episodes(self) -> Episodes:
+class _Tally:
+    """Adds up what happens in E episodes."""
+
+    def __init__(self, count: int) -> None:
+        def zeros() -> IntArray:
+            return np.zeros(count, np.int64)
+
+        self._returns, self._costs = np.zeros(count), np.zeros(count)
+        self._violating, self._steps, self._replaced = zeros(), zeros(), zeros()
+        self._modes = {mode: zeros() for mode in Mode}
+        self._origins = {origin: zeros() for origin in Origin}
+        self._opened_by = {cause: zeros() for cause in OpenedBy}
+        self._reasons: list[str] = []
+        self.seconds: list[float] = []
+
+    def add(self, episodes: IntArray, rows: IntArray, step: Step, decisions: Decisions) -> None:
+        """Adds one step of the robots in some rows, whose episodes have these numbers."""
+        mode, changed = decisions.mode[rows], decisions.mode[rows] != Mode.NOMINAL
+        self._returns[episodes] += step.reward[rows]
+        self._costs[episodes] += step.cost[rows]
+        self._violating[episodes] += step.cost[rows] > 0.0
+        self._steps[episodes] += 1
+        self._replaced[episodes] += decisions.certified[rows] & changed
+        for kind, count in self._modes.items():
+            count[episodes] += mode == kind
+        for origin, count in self._origins.items():
+            count[episodes] += changed & (decisions.origin[rows] == origin)
+        for cause, count in self._opened_by.items():
+            count[episodes] += decisions.opened_by[rows] == cause
+        self._reasons += [decisions.reason[i] or "unknown" for i in rows[mode == Mode.FALLBACK]]
+
+    def episodes(self, trajectory: Trajectory | None) -> Episodes:
         """The finished episodes."""
         return Episodes(
-            returns=self._sums[:, 0],
-            costs=self._sums[:, 1],
-            violating_steps=self._counts[:, 0],
-            steps=self._counts[:, 1],
+            returns=self._returns,
+            costs=self._costs,
+            violating_steps=self._violating,
+            steps=self._steps,
             modes=self._modes,
-            seconds=[],
+            origins=self._origins,
+            opened_by=self._opened_by,
+            certified_replaced=self._replaced,
+            seconds=self.seconds,
             reasons=self._reasons,
-            trajectory=self._trajectory(),
+            trajectory=trajectory,
         )
 
-    def _trajectory(self) -> Trajectory | None:
-        if self._record is None or self._hazards is None:
-            return None
-        every = np.array(self._record)
-        return Trajectory(
-            pose=every[..., 0:3],
-            goal=every[..., 3:5],
-            action=every[..., 5:7],
-            risk=every[..., 7],
-            mode=every[..., 8],
-            barrier=every[..., 9],
-            cost=every[..., 10],
-            reward=every[..., 11],
-            hazards=self._hazards,
-        )
+
+class _Recording:
+    """Keeps what the robots do, step by step."""
+
+    def __init__(self) -> None:
+        self._columns: dict[str, list[NDArray[Any]]] = {
+            field.name: [] for field in fields(Trajectory) if field.name != "hazards"
+        }
+        self._hazards: FloatArray | None = None
+
+    def before(self, env: PointGoalVectorEnv, decisions: Decisions) -> None:
+        """Keeps the state before a step, and what was decided."""
+        if self._hazards is None:
+            self._hazards = env.hazards.copy()
+        self._columns["pose"].append(env.pose)
+        self._columns["goal"].append(env.goal.copy())
+        for name in ("action", "risk", "mode", "opened_by", "barrier"):
+            self._columns[name].append(np.array(getattr(decisions, name)))
+
+    def after(self, step: Step) -> None:
+        """Keeps what came of the step, and blanks the rows whose episode was over."""
+        self._columns["cost"].append(step.cost.copy())
+        self._columns["reward"].append(step.reward.copy())
+        for column in self._columns.values():
+            row = column[-1]
+            row[~step.running] = "" if row.dtype.kind == "U" else np.nan
+
+    def trajectory(self) -> Trajectory:
+        """The recording."""
+        if self._hazards is None:
+            raise ValueError("nothing was recorded")
+        arrays = {name: np.array(rows) for name, rows in self._columns.items()}
+        return Trajectory(**arrays, hazards=self._hazards)

@@ -7,6 +7,7 @@ import math
 import signal
 import sys
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
@@ -16,25 +17,22 @@ import numpy as np
 import tyro
 from rich.console import Console
 
-from evaluation.closed_loop import SIDE_BY_SIDE, Episodes, run_episodes
-from evaluation.deciders import OverHttp
+from evaluation.closed_loop import Episodes, HazardSource, run_episodes
+from evaluation.errors import EvaluateError, ServiceError, ServiceGoneError
 from evaluation.pictures import Drive, animate, draw_drives, drive
 from evaluation.progress import progress_bar
-from evaluation.service import Service, ServiceError
 from evaluation.statistics import summarise
-from evaluation.tables import summary_table
+from evaluation.tables import TABLE_WIDTH, table_console, tables
 from models import Bundle, BundleError
-from monitor import Gate
+from monitor import GateName
+from pointgoal.loop import SIDE_BY_SIDE
 from pointgoal.observation import layout
 from pointgoal.seeds import Use
 from pointgoal.simulation import EPISODE_STEPS
-from server import ClientError
 
-_GATES: tuple[Gate, ...] = ("off", "risk", "always")
-
-
-class DemoError(ValueError):
-    """A demo that cannot be run as asked."""
+GATES: tuple[GateName, ...] = ("off", "risk", "always")
+"""The gates that the demo drives through, in the order in which it shows them."""
+_HAZARDS = {"lidar": "by lidar alone", "given": "given"}
 
 
 @dataclass(frozen=True)
@@ -52,23 +50,26 @@ class DemoConfig:
     """How many episodes for each gate, the same ones."""
     seed: int = 0
     """Seed of the episodes' layouts; another one has none of them in common."""
+    hazards: HazardSource = "lidar"
+    """What the filter knows of the hazards: the lidar alone, or their places in the body frame as well."""
     timeout: float = 1.0
     """How long a robot waits for its action [s]."""
 
     def check(self) -> None:
-        """Raises DemoError for settings that make no demo."""
+        """Raises EvaluateError for settings that make no demo."""
         if not 1 <= self.episodes <= SIDE_BY_SIDE or self.seed < 0:
-            raise DemoError(f"--episodes must be 1 to {SIDE_BY_SIDE} and --seed at least 0")
+            raise EvaluateError(f"--episodes must be 1 to {SIDE_BY_SIDE} and --seed at least 0")
         if not (math.isfinite(self.timeout) and self.timeout > 0.0):
-            raise DemoError(f"--timeout must be finite and positive, got {self.timeout}")
+            raise EvaluateError(f"--timeout must be finite and positive, got {self.timeout}")
 
 
 def run_demo(config: DemoConfig, console: Console) -> None:
     """Runs the demo.
 
     Raises:
-        DemoError: for settings that make no demo.
-        BundleError, ServiceError, ClientError: if a service cannot be had.
+        EvaluateError: for settings that make no demo.
+        BundleError, ServiceError: if a service cannot be had.
+        ServiceGoneError: if one stopped answering on the way.
         OSError: if the folder cannot be written.
     """
     config.check()
@@ -78,40 +79,54 @@ def run_demo(config: DemoConfig, console: Console) -> None:
     console.print(
         f"[bold]{bundle.id}[/] on {bundle.manifest.task}, through POST /act, {config.episodes} robots at once"
     )
-    runs = {gate: _drive_through(gate, bundle, config, console) for gate in _GATES}
+    runs = {gate: _drive_through(gate, bundle, config, console) for gate in GATES}
+    title = f"{config.episodes} episodes, hazards {_HAZARDS[config.hazards]}, over HTTP"
+    show(runs, config.out, bundle.manifest.threshold, title, console)
+    console.print(f"done in {time.monotonic() - started:.0f} s")
+
+
+def show(
+    runs: Mapping[GateName, Episodes], out: Path, threshold: float, title: str, console: Console
+) -> None:
+    """Prints and writes what became of the robots: a table, figures, a picture and an animation.
+
+    Args:
+        runs: gate → recorded episodes, the same ones under each.
+        out: the folder to write to.
+        threshold: of the gate `risk`.
+        title: of the table.
+        console: to print to.
+    """
     summaries = {gate: summarise(episodes) for gate, episodes in runs.items()}
-    table = summary_table(
-        f"{config.episodes} episodes, hazards given, over HTTP",
-        {f"gate {g}": s for g, s in summaries.items()},
-    )
+    table = tables(title, {f"gate {gate}": summary for gate, summary in summaries.items()})
     console.print(table)
     figures = {gate: summary.to_json() for gate, summary in summaries.items()}
-    (config.out / "summary.json").write_text(
-        json.dumps(figures, indent=2, allow_nan=False) + "\n", encoding="utf-8"
-    )
-    with (config.out / "table.txt").open("w", encoding="utf-8") as file:
-        Console(file=file, width=110).print(table)
+    (out / "summary.json").write_text(json.dumps(figures, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    with (out / "table.txt").open("w", encoding="utf-8") as file:
+        Console(file=file, width=TABLE_WIDTH).print(table)
     shown = choose_episode(runs["off"], runs["always"])
     drives: dict[str, Drive] = {
         gate: drive(episodes.trajectory, shown) for gate, episodes in runs.items() if episodes.trajectory
     }
-    picture, animation = config.out / "episode.png", config.out / "episode.gif"
-    title = f"One robot, one policy, three gates: episode {shown + 1} of {config.episodes}"
-    draw_drives(picture, drives, bundle.manifest.threshold, title)
+    picture, animation = out / "episode.png", out / "episode.gif"
+    headline = f"One robot, one policy, three gates: episode {shown + 1} of {len(runs['off'].returns)}"
+    draw_drives(picture, drives, threshold, headline)
     animate(animation, {gate: drives[gate] for gate in ("off", "always")})
-    console.print(f"{picture}: the path, where the filter acted, λ, barrier and cost over time")
+    console.print(f"{picture}: the paths, and over time the gate, what was sent, λ, barrier and cost")
     console.print(f"{animation}: the same episode without and with the filter")
-    console.print(f"done in {time.monotonic() - started:.0f} s")
 
 
-def _drive_through(gate: Gate, bundle: Bundle, config: DemoConfig, console: Console) -> Episodes:
+def _drive_through(gate: GateName, bundle: Bundle, config: DemoConfig, console: Console) -> Episodes:
     """The episodes under one gate, through a service of its own."""
+    from evaluation.remote import asked
+    from evaluation.service import Service
+
     bar = progress_bar(console)
     wanted = layout(bundle.manifest.level).to_json()
     with (
         bar,
         Service.start(config.bundle, gate) as service,
-        OverHttp(service.url, wanted, config.timeout) as decider,
+        asked(service.url, wanted, config.timeout) as (decider, _),
     ):
         job = bar.add_task(f"gate {gate}", total=config.episodes * EPISODE_STEPS)
         return run_episodes(
@@ -119,6 +134,7 @@ def _drive_through(gate: Gate, bundle: Bundle, config: DemoConfig, console: Cons
             decider,
             config.episodes,
             config.seed,
+            config.hazards,
             record=True,
             progress=lambda steps: bar.advance(job, steps),
             use=Use.DEMO,
@@ -141,12 +157,19 @@ def main() -> None:
     config = tyro.cli(DemoConfig, prog="python -m evaluation.demo")
     signal.signal(signal.SIGTERM, _interrupt)
     try:
-        run_demo(config, Console())
-    except (DemoError, BundleError, ServiceError, ClientError, OSError) as error:
-        Console(stderr=True).print(f"demo: {error}", style="red", markup=False, soft_wrap=True)
+        run_demo(config, table_console())
+    except (EvaluateError, BundleError, ServiceError, OSError) as error:
+        _complain(error)
         sys.exit(2)
+    except ServiceGoneError as error:
+        _complain(error)
+        sys.exit(1)
     except KeyboardInterrupt:
         sys.exit(130)
+
+
+def _complain(error: Exception) -> None:
+    Console(stderr=True).print(f"demo: {error}", style="red", markup=False, soft_wrap=True)
 
 
 if __name__ == "__main__":

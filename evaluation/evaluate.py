@@ -8,27 +8,28 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
 
-from evaluation.closed_loop import Episodes, HazardSource, TaskError, run_episodes
-from evaluation.deciders import Decider, InProcess, OverHttp
+from evaluation.closed_loop import Decides, Episodes, HazardSource, TaskError, run_episodes
+from evaluation.errors import EvaluateError, ServiceError, ServiceGoneError
 from evaluation.progress import progress_bar
-from evaluation.statistics import Summary, summarise
-from evaluation.tables import summary_table
+from evaluation.statistics import summarise
+from evaluation.tables import table_console, tables
+from guide import DEFAULT_STRENGTH, Strength
 from models import Bundle, BundleError
-from monitor import Gate, Monitor, MonitorError
+from monitor import GateName, Monitor, MonitorError
 from pointgoal.observation import layout
+from pointgoal.seeds import Use
 from pointgoal.simulation import EPISODE_STEPS
-from server import ClientError
-from server.serve import ServeError, read_api_key
 
-
-class EvaluateError(ValueError):
-    """An evaluation that cannot be run as asked."""
+Runs = dict[HazardSource, Episodes]
+"""Where the filter had the hazards from → the episodes."""
+_LABELS: dict[HazardSource, str] = {"lidar": "lidar alone", "given": "hazards given"}
 
 
 @dataclass(frozen=True)
@@ -36,20 +37,23 @@ class EvaluateConfig:
     """Runs a bundle in simulation and prints what became of the robots.
 
     Without --url the decisions are made in this process, all robots at once. With --url they are asked of a
-    running `lagnet-serve`, one connection a robot; gate and threshold are then the service's, and one that is
-    given here must be the same.
+    running `lagnet-serve`, one connection a robot; gate, threshold and guide are then the service's, and what
+    is given here must be the same.
     """
 
     bundle: Annotated[Path, tyro.conf.Positional]
     """The bundle's folder, for example models/NAME."""
     episodes: int = 100
     """How many episodes."""
-    gate: Gate | None = None
-    """When the filter is active: where the risk score exceeds the threshold (the default), always, never."""
+    gate: GateName | None = None
+    """When the filter is active: where the risk score or the barrier asks for it (default), always, never."""
     threshold: float | None = None
     """Risk score above which the gate `risk` activates the filter; by default the bundle's."""
-    hazards: HazardSource = "given"
-    """What the filter knows of the hazards: their places in the body frame, or the lidar alone."""
+    guide: Strength | None = None
+    """How much the guide may do: nothing, lead from a refused action on (the default), lead ahead."""
+    hazards: Literal["lidar", "given", "both"] = "lidar"
+    """What the filter knows of the hazards. A PointGoal task promises a robot its lidar alone; given: their
+    places in the body frame as well; both: the same episodes with either."""
     task: str | None = None
     """Gymnasium id of the task; by default the bundle's."""
     seed: int = 0
@@ -64,15 +68,16 @@ class EvaluateConfig:
     """File for the figures."""
 
 
-def evaluate(config: EvaluateConfig, console: Console) -> tuple[Summary, Episodes, dict[str, Any]]:
+def evaluate(config: EvaluateConfig, console: Console) -> tuple[Runs, dict[str, Any]]:
     """Runs the episodes.
 
     Returns:
-        The figures, the episodes, and what decided: model, gate, threshold.
+        The episodes by the hazards' source, and what decided: model, gate, threshold, guide.
 
     Raises:
         EvaluateError: for settings that make no evaluation.
-        BundleError, MonitorError, ClientError, ServeError: if what decides cannot be used.
+        BundleError, MonitorError, ServiceError: if what decides cannot be used.
+        ServiceGoneError: if the service stopped answering on the way.
     """
     if config.episodes < 1 or config.seed < 0:
         raise EvaluateError("--episodes must be at least 1 and --seed at least 0")
@@ -81,80 +86,106 @@ def evaluate(config: EvaluateConfig, console: Console) -> tuple[Summary, Episode
     if config.json is not None and not config.json.parent.is_dir():
         raise EvaluateError(f"--json {config.json}: there is no folder {config.json.parent}")
     bundle = Bundle.load(config.bundle)
+    task = config.task or bundle.manifest.task
+    sources: tuple[HazardSource, ...] = ("lidar", "given") if config.hazards == "both" else (config.hazards,)
     bar = progress_bar(console)
+    runs: Runs = {}
     with bar, _decider(config, bundle) as (decider, who):
-        task = config.task or bundle.manifest.task
-        job = bar.add_task(task, total=config.episodes * EPISODE_STEPS)
-
-        def advance(steps: int) -> None:
-            bar.advance(job, steps)
-
-        episodes = run_episodes(task, decider, config.episodes, config.seed, config.hazards, progress=advance)
-    return summarise(episodes), episodes, who
+        for source in sources:
+            job = bar.add_task(f"{task}, {_LABELS[source]}", total=config.episodes * EPISODE_STEPS)
+            advance = partial(bar.advance, job)
+            runs[source] = run_episodes(
+                task, decider, config.episodes, config.seed, source, progress=advance, use=Use.EVALUATION
+            )
+    return runs, who
 
 
 @contextmanager
-def _decider(config: EvaluateConfig, bundle: Bundle) -> Iterator[tuple[Decider, dict[str, Any]]]:
-    """Who decides, and how it calls itself: model, gate, threshold."""
+def _decider(config: EvaluateConfig, bundle: Bundle) -> Iterator[tuple[Decides, dict[str, Any]]]:
+    """What decides, and how it calls itself: model, gate, threshold, guide."""
     if config.url is None:
-        monitor = Monitor.load(config.bundle, config.gate or "risk", config.threshold)
-        yield InProcess(monitor), {"model": bundle.id, "gate": monitor.gate, "threshold": monitor.threshold}
+        guide = config.guide or DEFAULT_STRENGTH
+        monitor = Monitor.load(config.bundle, config.gate or "risk", config.threshold, guide=guide)
+        gate = monitor.gate
+        yield monitor, {"model": bundle.id, "gate": gate.name, "threshold": gate.threshold, "guide": guide}
         return
-    key = read_api_key(config.api_key_file)
-    with OverHttp(config.url, layout(bundle.manifest.level).to_json(), config.timeout, key) as decider:
-        served = decider.connect()
-        if served.model != bundle.id:
-            raise EvaluateError(f"{config.url} serves {served.model}, not {bundle.id}")
-        if config.gate not in (None, served.gate):
-            raise EvaluateError(f"{config.url} has gate {served.gate}, not {config.gate}")
-        if config.threshold not in (None, served.threshold):
-            raise EvaluateError(f"{config.url} has threshold {served.threshold}, not {config.threshold}")
-        yield decider, {"model": served.model, "gate": served.gate, "threshold": served.threshold}
+    from evaluation.remote import asked
+
+    wanted = layout(bundle.manifest.level).to_json()
+    with asked(config.url, wanted, config.timeout, config.api_key_file) as (decider, served):
+        who = {name: getattr(served, name) for name in ("model", "gate", "threshold", "guide")}
+        if who["model"] != bundle.id:
+            raise EvaluateError(f"{config.url} serves {who['model']}, not {bundle.id}")
+        for name in ("gate", "threshold", "guide"):
+            if getattr(config, name) not in (None, who[name]):
+                raise EvaluateError(f"{config.url} has {name} {who[name]}, not {getattr(config, name)}")
+        yield decider, who
 
 
-def write_json(
-    path: Path, config: EvaluateConfig, who: dict[str, Any], summary: Summary, episodes: Episodes
-) -> None:
+def write_json(path: Path, config: EvaluateConfig, who: dict[str, Any], runs: Runs) -> None:
     """Writes the figures, and each episode's, as JSON.
 
     Raises:
         EvaluateError: if the file cannot be written.
     """
     asked = {name: str(value) if isinstance(value, Path) else value for name, value in asdict(config).items()}
-    each = {
-        "return": episodes.returns.tolist(),
-        "cost": episodes.costs.tolist(),
-        "violating_steps": episodes.violating_steps.tolist(),
-        "steps": episodes.steps.tolist(),
+    figures = {
+        source: {"summary": summarise(episodes).to_json(), "each_episode": _each(episodes)}
+        for source, episodes in runs.items()
     }
-    content = {"asked": asked, "decided_by": who, "summary": summary.to_json(), "each_episode": each}
+    content = {"asked": asked, "decided_by": who, "hazards": figures}
     try:
         path.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
     except OSError as error:
         raise EvaluateError(f"--json {path}: cannot be written: {error.strerror or error}") from error
 
 
+def _each(episodes: Episodes) -> dict[str, Any]:
+    return {
+        "return": episodes.returns.tolist(),
+        "cost": episodes.costs.tolist(),
+        "violating_steps": episodes.violating_steps.tolist(),
+        "steps": episodes.steps.tolist(),
+        "open_steps": episodes.open_steps.tolist(),
+        "interventions": episodes.interventions.tolist(),
+    }
+
+
 def _title(config: EvaluateConfig, who: dict[str, Any]) -> str:
-    gate = f"gate {who['gate']}, threshold {who['threshold']:.4g}"
-    return f"{who['model']}, {gate}, hazards {config.hazards}, {config.url or 'in process'}"
+    return (
+        f"{who['model']}, {config.episodes} episodes, {config.url or 'in process'}\n"
+        f"gate {who['gate']}, threshold {who['threshold']:.4g}, guide {who['guide']}"
+    )
 
 
 def main() -> None:
-    """Entry point of `lagnet-evaluate`: exit status 0, or 2 if it could not be run as asked."""
+    """Entry point of `lagnet-evaluate`.
+
+    Exit status 0; 1 if the service failed on the way; 2 if nothing could be run as asked.
+    """
     config = tyro.cli(EvaluateConfig, prog="lagnet-evaluate")
-    console = Console()
+    console = table_console()
     try:
-        summary, episodes, who = evaluate(config, console)
-        console.print(summary_table(_title(config, who), {f"{summary.episodes} episodes": summary}))
-        for reason, count in summary.reasons.items():
-            console.print(f"  fallback × {count}: {reason}", markup=False)
+        runs, who = evaluate(config, console)
+        summaries = {_LABELS[source]: summarise(episodes) for source, episodes in runs.items()}
+        console.print(tables(_title(config, who), summaries))
+        for label, summary in summaries.items():
+            for reason, count in summary.reasons.items():
+                console.print(f"{label}: fallback × {count}: {reason}", markup=False)
         if config.json is not None:
-            write_json(config.json, config, who, summary, episodes)
-    except (EvaluateError, TaskError, BundleError, MonitorError, ClientError, ServeError) as error:
-        Console(stderr=True).print(f"lagnet-evaluate: {error}", style="red", markup=False, soft_wrap=True)
+            write_json(config.json, config, who, runs)
+    except (EvaluateError, TaskError, BundleError, MonitorError, ServiceError) as error:
+        _complain(error)
         sys.exit(2)
+    except ServiceGoneError as error:
+        _complain(error)
+        sys.exit(1)
     except KeyboardInterrupt:
         sys.exit(130)
+
+
+def _complain(error: Exception) -> None:
+    Console(stderr=True).print(f"lagnet-evaluate: {error}", style="red", markup=False, soft_wrap=True)
 
 
 if __name__ == "__main__":

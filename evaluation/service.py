@@ -14,15 +14,12 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO, Self
 
-from monitor import Gate
+from evaluation.errors import ServiceError
+from monitor import GateName
 from server.serve import KEY_VARIABLE
 
 _START_SECONDS = 180.0
 _STOP_SECONDS = 10.0
-
-
-class ServiceError(RuntimeError):
-    """A service that did not start."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +42,7 @@ class Service:
         return self.errors.read()
 
     @staticmethod
-    def start(bundle: Path, gate: Gate, threshold: float | None = None) -> Service:
+    def start(bundle: Path, gate: GateName, threshold: float | None = None) -> Service:
         """Starts `lagnet-serve` on a free port of the loopback.
 
         Raises:

@@ -98,21 +98,22 @@ class BarrierFilter:
     def decide(self, view: Scene, nominal: FloatArray, memory: Memory, active: BoolArray) -> Decisions:
         """Filter N actions for what is seen; arguments as for `filter`, all of them there and checked."""
         step = Step(self._settings, view, nominal, memory, active)
-        least = np.full(len(nominal), self.config.hysteresis)
-        rows = np.flatnonzero(active)
-        step.certified[rows] = step.certify(rows, nominal[rows], least[rows])
         refused = active & ~step.certified
-        led = np.zeros(len(nominal), np.bool_)
-        if self.guide is not None and rows.size:
-            rows, proposed = self.guide.propose(step)
-            step.send(rows, proposed, Mode.GUIDED, Origin.GUIDE)
-            led[rows] = True
-            refused[rows] = ~step.certify(rows, proposed, least[rows])
+        free = np.ones(len(nominal), np.bool_)
+        if self.guide is not None:
+            led, proposed = self.guide.propose(step)
+            if led.size:
+                step.send(led, proposed, Mode.GUIDED, Origin.GUIDE)
+                refused[led] = ~step.certify(led, proposed, np.full(len(led), self.config.hysteresis))
+                free[led] = False
         left = np.flatnonzero(refused)
         if left.size:
             step.blame(left, view.source[left, step.nearest(left)])
-            left = self._by_qp(step, Programme(step, left, ~led[left]))
-            self._fall_back(step, self._by_search(step, left))
+            # Where the best backup keeps less than any certificate needs, there is none to be found.
+            hopeless = view.barrier[left] < step.need[left]
+            hoped = left[~hopeless]
+            hoped = self._by_search(step, self._by_qp(step, Programme(step, hoped, free[hoped])))
+            self._fall_back(step, np.concatenate([left[hopeless], hoped]))
         return step.decisions()
 
     def problem(
@@ -133,10 +134,7 @@ class BarrierFilter:
         )
         nominal = scene.check_action(np.asarray(nominal_action)[None], 1)
         step = Step(self._settings, view, nominal, scene.check_memory(None, 1), np.ones(1, np.bool_))
-        row = np.zeros(1, np.int64)
-        if step.certify(row, nominal, np.full(1, self.config.hysteresis))[0]:
-            return None
-        return Programme(step, row, np.ones(1, np.bool_)).problem()
+        return Programme(step, np.zeros(1, np.int64), step.active).problem() if step.refused else None
 
     def _by_qp(self, step: Step, programme: Programme) -> IntArray:
         """Send the QP's own solution where it is certified; the rows that are left."""
@@ -170,7 +168,7 @@ class BarrierFilter:
         kept, inside = outcome == kernel.COMMITTED, outcome == kernel.INSIDE
         # A scan can leave places possible that the last one had ruled out, and then no backup keeps out of
         # them all. The plan was certified against those possible then, and the hazards are among them.
-        planned = ~kept & ~inside & step.by_scan(rows) & (step.memory["left"][rows] > 0)
+        planned = ~kept & ~inside & step.by_scan(rows) & step.has_plan(rows)
         for which, origin, reason in (
             (kept, Origin.PLAN, "no certified action: committed backup"),
             (inside, Origin.HARM, "inside a hazard: driving out"),

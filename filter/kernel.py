@@ -29,6 +29,7 @@ from system.point_robot import State, advance, follow, stopping
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
 Records = NDArray[np.void]
 
 SEEN = np.dtype(
@@ -89,31 +90,94 @@ def _obstacles(
 @entry
 def see(
     settings: Records,
-    motion: FloatArray,
+    observation: FloatArray,
+    columns: tuple[int, int, int, int, int],
     given: FloatArray,
-    readings: FloatArray,
     seen: Records,
     obstacles: FloatArray,
     source: IntArray,
-) -> None:
+) -> int:
     """Find all robots' obstacles and backups; the last three arguments receive them.
 
-    ``motion`` (N, 3) is the velocity ahead and to the left and the yaw rate, ``given`` (N, n, 2) hazards [m],
-    ``readings`` (N, 16) the hazards' lidar, or (N, 0); ``source`` (N, M) receives each obstacle's hazard, or
-    n + its bin.
+    ``columns`` tells where in an ``observation`` (N, O) the velocity ahead, followed by that to the left, and
+    the yaw rate stand, where the hazards' lidar starts and ends, and where the goal's starts. ``given`` (N, n,
+    2) are hazards [m]; ``source`` (N, M) receives each obstacle's hazard, or n + its bin. Returns the place of
+    the first number of all observations that is not finite, -1 if there is none.
     """
     config = settings[0]
-    for k in range(len(motion)):
+    velocity, yaw, first, last, _ = columns
+    for k in range(observation.shape[0]):
+        for i in range(observation.shape[1]):
+            if not math.isfinite(observation[k, i]):
+                return k * observation.shape[1] + i
         one = seen[k]
-        one.vx, one.vy, one.yaw_rate = motion[k]
+        one.vx = observation[k, velocity]
+        one.vy = observation[k, velocity + 1]
+        one.yaw_rate = observation[k, yaw]
         state = _state(one)
-        one.count = _obstacles(config, state, given[k], readings[k], obstacles[k], source[k])
+        one.count = _obstacles(config, state, given[k], observation[k, first:last], obstacles[k], source[k])
         at = stopping(config.robot, state)
         now = best_backup(config, obstacles[k], one.count, at, FAR, False)
         one.now.clearance = min(now[0], LIDAR_RANGE)
         one.now.nearest, one.now.backup, one.now.steps = now[1:]
         sure = best_backup(config, obstacles[k], one.count, at, 0.0, True)
         one.sure.clearance, one.sure.nearest, one.sure.backup, one.sure.steps = sure
+    return -1
+
+
+@entry
+def screen(
+    settings: Records,
+    seen: Records,
+    obstacles: FloatArray,
+    nominal: FloatArray,
+    active: BoolArray,
+    certificates: Records,
+    certified: BoolArray,
+    side: NDArray[np.int8],
+    left: NDArray[np.int8],
+    plan: FloatArray,
+) -> int:
+    """Look for certificates of the nominal actions (N, 2) where the gate is open; how many have none.
+
+    Where ``active`` (N,) is False, the sure backup stands for one. ``certified`` (N,) receives which have one;
+    a remembered ``side`` (N,) fades; ``left`` (N,) and ``plan`` (N, PLAN_STEPS, 2) receive the plans.
+    """
+    config = settings[0]
+    refused = 0
+    for k in range(len(seen)):
+        one, state = certificates[k], _state(seen[k])
+        u1, u2 = nominal[k]
+        certified[k] = False
+        if active[k]:
+            found = certify_one(config, obstacles[k], seen[k].count, state, u1, u2, config.hysteresis)
+            one.clearance, one.nearest, one.backup, one.steps = found
+            certified[k] = found[0] >= config.hysteresis
+            refused += not certified[k]
+        else:
+            sure = seen[k].sure
+            one.clearance, one.nearest = sure.clearance, sure.nearest
+            one.backup, one.steps = sure.backup, sure.steps
+        side[k] -= (side[k] > 0) - (side[k] < 0)
+        left[k] = _plan(config, state, u1, u2, one.backup, one.steps, plan[k])
+    return refused
+
+
+@compiled
+def _plan(
+    config: Settings, state: State, u1: float, u2: float, backup: int, steps: int, plan: FloatArray
+) -> int:
+    """Write down, action by action, a backup from where an action leads; how many actions it has."""
+    plan[:] = 0.0
+    if steps > 0:
+        robot = config.robot
+        at = stopping(robot, advance(robot, state, u1, u2, robot.substeps))
+        for step in range(steps):
+            thrust, turn = law(robot, backup, at)
+            at = follow(robot, at, thrust, turn)
+            plan[step, 0] = thrust * robot.force_limit
+            plan[step, 1] = turn
+    return steps
 
 
 @entry
@@ -297,21 +361,11 @@ def keep_plans(
     left: NDArray[np.int8],
     plan: FloatArray,
 ) -> None:
-    """Write down, action by action, the backups of the certificates, from where ``action`` (N, 2) leads.
+    """Write down the backups of the certificates, from where ``action`` (N, 2) leads.
 
     ``left`` (N,) receives how many actions each has, ``plan`` (N, PLAN_STEPS, 2) the actions.
     """
-    config = settings[0]
-    robot = config.robot
     for k in rows:
-        kind, steps = certificates[k].backup, certificates[k].steps
-        left[k] = steps
-        plan[k] = 0.0
-        if steps == 0:
-            continue
-        end = advance(robot, _state(seen[k]), action[k, 0], action[k, 1], robot.substeps)
-        at = stopping(robot, end)
-        for step in range(steps):
-            thrust, turn = law(robot, kind, at)
-            at = follow(robot, at, thrust, turn)
-            plan[k, step] = (thrust * robot.force_limit, turn)
+        one = certificates[k]
+        u1, u2 = action[k]
+        left[k] = _plan(settings[0], _state(seen[k]), u1, u2, one.backup, one.steps, plan[k])

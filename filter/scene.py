@@ -23,22 +23,19 @@ class _Columns:
     """Where an observation of one size has what the filter reads.
 
     Attributes:
-        motion: velocity ahead, velocity to the left, yaw rate.
-        goal: the goal's lidar.
-        hazards: the hazards' lidar; empty at level 0, which has none.
+        read: for `kernel.see`: velocity ahead, yaw rate, start and end of the hazards' lidar, which is empty
+            at level 0, and start of the goal's.
+        hazards: the hazards' lidar.
     """
 
-    motion: list[int]
-    goal: slice
+    read: tuple[int, int, int, int, int]
     hazards: slice
 
     @staticmethod
     def of(where: ObservationLayout) -> _Columns:
-        velocity = where.slice("velocimeter").start
         hazards = where.slice("hazards_lidar") if "hazards_lidar" in where else slice(0, 0)
-        return _Columns(
-            [velocity, velocity + 1, where.slice("gyro").stop - 1], where.slice("goal_lidar"), hazards
-        )
+        motion = where.slice("velocimeter").start, where.slice("gyro").stop - 1
+        return _Columns((*motion, hazards.start, hazards.stop, where.slice("goal_lidar").start), hazards)
 
 
 _COLUMNS = {where.size: _Columns.of(where) for where in (layout(0), layout(1))}
@@ -49,61 +46,76 @@ class Scene:
     """N robots and what is near them.
 
     Attributes:
+        observation: (N, O).
+        columns: where the filter's numbers stand in it, see `kernel.see`.
+        given: (N, n, 2) hazards [m].
         seen: (N,) of `kernel.SEEN`: motion, count of obstacles, best backup.
         obstacles: (N, M, COLUMNS); of each robot's, the first ``seen["count"]`` count.
         source: (N, M) each one's hazard, or, behind those, its lidar bin.
-        given: (N, n, 2) hazards [m].
-        readings: (N, 16) the hazards' lidar, or (N, 0).
-        goal: (N, 16) the goal's lidar.
     """
 
+    observation: FloatArray
+    columns: tuple[int, int, int, int, int]
+    given: FloatArray
     seen: NDArray[np.void]
     obstacles: FloatArray
     source: NDArray[np.int64]
-    given: FloatArray
-    readings: FloatArray
-    goal: FloatArray
 
     def __len__(self) -> int:
         return len(self.seen)
 
     @property
+    def readings(self) -> FloatArray:
+        """(N, 16) the hazards' lidar, or (N, 0)."""
+        return self.observation[:, self.columns[2] : self.columns[3]]
+
+    @property
     def barrier(self) -> FloatArray:
         """(N,) clearance [m] beyond the margin that the best backup keeps; at most the lidar's range."""
-        return np.asarray(self.seen["now"]["clearance"])
+        barrier: FloatArray = self.seen["now"]["clearance"]
+        return barrier
 
     @property
     def low(self) -> BoolArray:
         """(N,) whether the barrier is so low that some action may lead below 0: below the floor."""
-        return np.asarray(self.seen["sure"]["clearance"] < 0.0)
+        low: BoolArray = self.seen["sure"]["clearance"] < 0.0
+        return low
 
 
 def look(settings: NDArray[np.void], observation: FloatArray, given: FloatArray | None) -> Scene:
-    """Find obstacles and best backups; the arguments are checked ones."""
+    """Find obstacles and best backups.
+
+    Args:
+        settings: (1,) of `SETTINGS`.
+        observation: (N, 60) or (N, 28).
+        given: (N, n, 2) hazards [m]; None: none are given.
+
+    Raises:
+        FilterInputError: if the observation has a value that is not finite.
+    """
     n, width = observation.shape
     columns = _COLUMNS[width]
     if given is None:
         given = np.empty((n, 0, 2))
-    readings = np.ascontiguousarray(observation[:, columns.hazards])
-    size = given.shape[1] + (CONES if readings.shape[1] else 0)
+    size = given.shape[1] + (CONES if columns.hazards.stop else 0)
     seen = np.empty(n, SEEN)
     obstacles, source = np.empty((n, size, COLUMNS)), np.empty((n, size), dtype=np.int64)
-    see(settings, observation[:, columns.motion], given, readings, seen, obstacles, source)
-    return Scene(seen, obstacles, source, given, readings, observation[:, columns.goal])
+    bad = see(settings, observation, columns.read, given, seen, obstacles, source)
+    if bad >= 0:
+        raise FilterInputError(f"observation[{bad % width}]", f"is {observation.flat[bad]}")
+    return Scene(observation, columns.read, given, seen, obstacles, source)
 
 
 def check_observation(observation: ArrayLike) -> FloatArray:
     """(N, 60) or (N, 28).
 
     Raises:
-        FilterInputError: if it is not, or has a value that is not finite.
+        FilterInputError: if it is not.
     """
     checked = _array("observation", observation)
     if checked.ndim != 2 or checked.shape[1] not in _COLUMNS:
         sizes = " or ".join(f"(N, {size})" for size in sorted(_COLUMNS, reverse=True))
         raise FilterInputError("observation", f"expected shape {sizes}, got {checked.shape}")
-    if not np.isfinite(checked).all():
-        raise FilterInputError("observation", "has values that are not finite")
     return checked
 
 

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import math
+from functools import cached_property, lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 
-from decision import Decisions, Memory, Mode, OpenedBy, Origin, next_of_plan
+from decision import Decisions, Memory, Mode, OpenedBy, Origin, next_of_plan, texts, unknown
 from filter import kernel
+from filter.certificate import CERTIFICATE
 from filter.scene import Scene
 from pointgoal.observation import LIDAR_RANGE
 
@@ -14,12 +18,16 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
-_MODE = np.array([""], dtype=f"<U{max(map(len, Mode))}")
-_ORIGIN = np.array([""], dtype=f"<U{max(map(len, Origin))}")
+
+@lru_cache(maxsize=64)
+def _nowhere(n: int) -> IntArray:
+    made = np.full(n, -1)
+    made.setflags(write=False)
+    return made
 
 
 class Step:
-    """What is to be sent, and why, as far as it is decided.
+    """What is to be sent, and why, as far as it is decided; at first the nominal actions, screened.
 
     Attributes:
         settings: (1,) of `filter.config.SETTINGS`.
@@ -29,8 +37,7 @@ class Step:
         active: (N,) where the filter may change it.
         certificates: (N,) of `CERTIFICATE`, the last one looked for: in the end that of ``action``.
         certified: (N,) whether the nominal action has one.
-        need: (N,) clearance [m] that certifies what the filter puts in place of a refused action: 0, or what
-            there is, if that is a little less: a robot that has lost a millimetre may keep what it has.
+        refused: how many of the active ones have none.
         memory: (N,) of `MEMORY`, becomes the next call's.
     """
 
@@ -40,22 +47,38 @@ class Step:
         n = len(nominal)
         self.settings = settings
         self.scene = scene
-        self.nominal = nominal
-        self.action = nominal.copy()
+        self.nominal = self.action = nominal
         self.active = active
-        # Where the gate is closed, that is a plan whatever the nominal action is.
-        self.certificates = scene.seen["sure"].copy()
-        self.certified = np.zeros(n, np.bool_)
-        self.memory = memory.copy()
-        self.memory["side"] -= np.sign(memory["side"])
-        self._planned = np.ones(n, np.bool_)
-        self._mode = np.full(n, Mode.NOMINAL, _MODE.dtype)
-        self._origin = np.zeros(n, _ORIGIN.dtype)
-        self._hazard = np.full(n, -1)
+        self.certificates = np.empty(n, CERTIFICATE)
+        self.certified = np.empty(n, np.bool_)
+        self.memory, self._before = memory.copy(), memory
+        self._mode, self._origin = texts(Mode.NOMINAL, n), texts("", n)
+        self._hazard = _nowhere(n)
         self._reason: list[str | None] = [None] * n
-        one = settings[0]
-        inner = 0.5 * max(one["margin"] - one["sure"], 0.0)
-        self.need = np.minimum(np.maximum(scene.barrier, -inner), 0.0)
+        # Whose plans are still to be written down.
+        self._open: BoolArray | None = None
+        self.refused = kernel.screen(
+            settings,
+            scene.seen,
+            scene.obstacles,
+            nominal,
+            active,
+            self.certificates,
+            self.certified,
+            self.memory["side"],
+            self.memory["left"],
+            self.memory["plan"],
+        )
+
+    @cached_property
+    def need(self) -> FloatArray:
+        """(N,) clearance [m] that certifies what the filter puts in place of a refused action.
+
+        It is 0, or what there is, if that is a little less: a robot that has lost a millimetre of its margin
+        may keep what it has.
+        """
+        inner = 0.5 * max(self.settings["margin"][0] - self.settings["sure"][0], 0.0)
+        return np.asarray(np.minimum(np.maximum(self.scene.barrier, -inner), 0.0))
 
     def certify(self, rows: IntArray, action: FloatArray, least: FloatArray) -> BoolArray:
         """Whether some rows' actions (n, 2) have certificates that keep so much clearance (n,) [m]."""
@@ -114,40 +137,63 @@ class Step:
         self, rows: IntArray, action: FloatArray, mode: Mode, origin: Origin, reason: str | None = None
     ) -> None:
         """Send another action (n, 2) to some rows' robots than the nominal one."""
+        if not rows.size:
+            return
+        if self._open is None:
+            self.action = self.nominal.copy()
+            self._mode, self._origin = self._mode.copy(), self._origin.copy()
+            self._open = np.zeros(len(self.action), np.bool_)
         self.action[rows] = action
         self._mode[rows] = mode
         self._origin[rows] = origin
+        self._open[rows] = True
         for k in rows if reason is not None else ():
             self._reason[k] = reason
 
     def blame(self, rows: IntArray, hazard: IntArray) -> None:
         """Name the hazards (n,) that some rows' interventions come from, -1 for none."""
-        self._hazard[rows] = hazard
+        if rows.size:
+            if not self._hazard.flags.writeable:
+                self._hazard = self._hazard.copy()
+            self._hazard[rows] = hazard
+
+    def has_plan(self, rows: IntArray) -> BoolArray:
+        """Which of some rows' robots came with a plan that is not at its end (n,)."""
+        left: BoolArray = self._before["left"][rows] > 0
+        return left
 
     def go_on(self, rows: IntArray, reason: str) -> None:
         """Send the next action of some rows' plans."""
-        action, self.memory[rows] = next_of_plan(self.memory[rows])
-        self.send(rows, action, Mode.FALLBACK, Origin.PLAN, reason)
-        self._planned[rows] = False
+        if rows.size:
+            action, self.memory[rows] = next_of_plan(self._before[rows])
+            self.send(rows, action, Mode.FALLBACK, Origin.PLAN, reason)
+            self._settled(rows)
 
     def forget(self, rows: IntArray) -> None:
         """Leave some rows without a plan."""
         self.memory["left"][rows] = 0
-        self._planned[rows] = False
+        self._settled(rows)
+
+    def _settled(self, rows: IntArray) -> None:
+        """Some rows' memory is as it is to be."""
+        if self._open is not None:
+            self._open[rows] = False
 
     def decisions(self) -> Decisions:
-        """The step, decided, and the plans that the certificates end in written down."""
-        n = len(self.action)
-        rows, memory = np.flatnonzero(self._planned), self.memory
-        kernel.keep_plans(
-            self.settings,
-            self.scene.seen,
-            rows,
-            self.action,
-            self.certificates,
-            memory["left"],
-            memory["plan"],
-        )
+        """The step, decided, and the plans that the certificates end in written down.
+
+        Whose gate is closed is said to have none open; why it is open is the caller's to say.
+        """
+        n, memory = len(self.action), self.memory
+        opened_by = texts(OpenedBy.ALWAYS, n)
+        if not self.active.all():
+            opened_by = np.where(self.active, opened_by, texts("", n))
+        if self._open is not None:
+            rows = np.flatnonzero(self._open)
+            left, plan = memory["left"], memory["plan"]
+            kernel.keep_plans(
+                self.settings, self.scene.seen, rows, self.action, self.certificates, left, plan
+            )
         return Decisions(
             action=self.action,
             nominal_action=self.nominal,
@@ -157,8 +203,8 @@ class Step:
             barrier=self.scene.barrier,
             hazard=self._hazard,
             reason=self._reason,
-            risk=np.full(n, np.nan),
-            threshold=np.nan,
-            opened_by=np.where(self.active, OpenedBy.ALWAYS, ""),
-            memory=self.memory,
+            risk=unknown(n),
+            threshold=math.nan,
+            opened_by=opened_by,
+            memory=memory,
         )

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from filter import FilterConfig, Step
-from filter.circulation import SIDE_STEPS
 from filter.config import settings
 from guide.path import Path, drives_round, shortest_path, steer
 from pointgoal.observation import LIDAR_BINS
@@ -64,25 +63,11 @@ class GuideConfig:
                 raise ValueError(f"{name} must be in [0, 100), got {getattr(self, name)!r}")
 
 
+_NOBODY, _NOTHING = np.empty(0, np.int64), np.empty((0, 2))
 _OWN = tuple(GuideConfig.__dataclass_fields__)
 _OF_FILTER = ("margin", "position_error", "bearing_error", "hazard_radius")
 GUIDE = np.dtype([("robot", ROBOT), *((name, "f8") for name in (*_OF_FILTER, *_OWN))])
 """The numbers of a guide as compiled code takes them."""
-
-
-LED = np.dtype(
-    [
-        ("action", "f8", (2,)),
-        ("refused", "?"),
-        ("engaged", "?"),
-        ("leads", "?"),
-        ("side", "i1"),
-        ("hazard", "i8"),
-    ]
-)
-"""One robot that may be led: its nominal action u1, u2, or the reference in its place; whether the nominal
-one has no certificate; whether the robot is being led past something; whether it is led in this step; the
-side on which it passes what is in its way; the hazard, or n + the bin, that is in the way, -1 for none."""
 
 
 class Guide:
@@ -116,26 +101,28 @@ class Guide:
 
     def propose(self, step: Step) -> tuple[IntArray, FloatArray]:
         """The rows (n,) of the robots that are led, and the references (n, 2) in place of their actions."""
-        scene, memory = step.scene, step.memory
-        engaged = memory["guided"] > 0
-        wanted = step.active
-        if self.strength != "ahead":
-            wanted = step.active & (~step.certified | engaged) & (self.strength == "refusal")
-        rows = np.flatnonzero(wanted)
-        memory["guided"][~wanted] = 0
-        if not rows.size:
-            return rows, np.empty((0, 2))
-        led = np.empty(len(rows), LED)
-        led["action"] = step.nominal[rows]
-        led["refused"] = ~step.certified[rows]
-        led["engaged"] = engaged[rows] | (self.strength == "ahead")
-        led["side"] = memory["side"][rows]
-        lead(self._settings, scene.seen, scene.given, scene.readings, scene.goal, rows, led)
-        memory["side"][rows] = led["side"]
-        memory["guided"][rows] = led["engaged"]
-        led, rows = led[led["leads"]], rows[led["leads"]]
-        step.blame(rows, led["hazard"])
-        return rows, led["action"]
+        scene, memory, ahead = step.scene, step.memory, self.strength == "ahead"
+        if not ahead and (self.strength == "off" or not (step.refused or memory["guided"].any())):
+            return _NOBODY, _NOTHING
+        n = len(scene)
+        proposed, leads, hazard = step.nominal.copy(), np.zeros(n, np.bool_), np.empty(n, np.int64)
+        lead(
+            self._settings,
+            scene.seen,
+            scene.observation,
+            scene.columns,
+            scene.given,
+            step.active,
+            step.certified,
+            ahead,
+            memory["guided"],
+            proposed,
+            leads,
+            hazard,
+        )
+        rows = np.flatnonzero(leads)
+        step.blame(rows, hazard[rows])
+        return rows, proposed[rows]
 
 
 @compiled
@@ -159,10 +146,18 @@ def _discs(config: Any, given: FloatArray, readings: FloatArray, out: FloatArray
 
 
 @compiled
-def _way(
-    config: Any, discs: FloatArray, count: int, goal: tuple[bool, float, float], state: State, one: Any
-) -> Path:
-    """The way of one robot, and in ``one``, a row of `LED`, whether it is led along it.
+def _leads(
+    config: Any,
+    discs: FloatArray,
+    count: int,
+    goal: tuple[bool, float, float],
+    state: State,
+    nominal: FloatArray,
+    refused: bool,
+    engaged: bool,
+    side: int,
+) -> tuple[bool, bool, Path]:
+    """Whether to lead a robot in this step, whether it is still being led past something, and the way.
 
     It is led while a hazard stands in the straight way to the goal and the nominal action does not drive
     round it by itself, and also where the robot hardly moves and the nominal action is refused: such a robot
@@ -170,54 +165,64 @@ def _way(
     """
     seen, goal_x, goal_y = goal
     now = stopping(config.robot, state)
-    side = 1 if one.side > 0 else (-1 if one.side < 0 else 0)
     way = shortest_path(discs, count, (goal_x, goal_y), (now.zx, now.zy), side, config.steadiness)
     hardly = math.hypot(now.zx, now.zy) < config.slow
-    blocked = seen and way.blocker >= 0 and way.distance < config.lookahead
-    one.engaged = blocked and (one.engaged or hardly)
-    if blocked:
-        one.leads = one.engaged and (
-            one.refused or not drives_round(config, discs, count, state, one.action, way)
-        )
-    else:
-        one.leads = seen and one.refused and hardly
-    return way
+    if not (seen and way.blocker >= 0 and way.distance < config.lookahead):
+        return seen and refused and hardly, False, way
+    if not (engaged or (refused and hardly)):
+        return False, False, way
+    return refused or not drives_round(config, discs, count, state, nominal, way), True, way
 
 
 @entry
 def lead(
     settings: Records,
     seen: Records,
+    observation: FloatArray,
+    columns: tuple[int, int, int, int, int],
     given: FloatArray,
-    readings: FloatArray,
-    goals: FloatArray,
-    rows: IntArray,
-    led: Records,
+    active: NDArray[np.bool_],
+    certified: NDArray[np.bool_],
+    ahead: bool,
+    guided: NDArray[np.int8],
+    proposed: FloatArray,
+    leads: NDArray[np.bool_],
+    hazard: IntArray,
 ) -> None:
-    """Find the references of those robots that are led.
+    """Find the references of those of N robots that are led.
 
     Args:
         settings: (1,) of `GUIDE`.
         seen: (N,) of `filter.kernel.SEEN`.
+        observation: (N, O).
+        columns: as for `filter.kernel.see`.
         given: (N, n, 2) hazards [m].
-        readings: (N, 16) the hazards' lidar, or (N, 0).
-        goals: (N, 16) the goal's lidar.
-        rows: (n,) which robots may be led.
-        led: (n,) of `LED`, overwritten.
+        active: (N,) who may be led.
+        certified: (N,) whose nominal action has a certificate.
+        ahead: whether to lead whoever has something in the way, refused or not.
+        guided: (N,) the side on which a robot is being led past something, 0 for none, overwritten.
+        proposed: (N, 2) the nominal actions u1, u2; overwritten where it leads.
+        leads: (N,) receives whether it leads.
+        hazard: (N,) receives the hazard, or n + the bin, that is in the way; -1 for none.
     """
     config = settings[0]
+    _, _, first, last, goal = columns
     size = given.shape[1] + LIDAR_BINS
     discs, source = np.empty((size, 3)), np.empty(size, dtype=np.int64)
-    for j in range(len(rows)):
-        k = rows[j]
-        one = led[j]
+    for k in range(len(seen)):
+        if not (active[k] and (ahead or guided[k] != 0 or not certified[k])):
+            guided[k] = 0
+            continue
         state = State(0.0, 0.0, 0.0, seen[k].vx, seen[k].vy, seen[k].yaw_rate)
-        count = _discs(config, given[k], readings[k], discs, source)
-        way = _way(config, discs, count, decode_goal(goals[k]), state, one)
-        one.hazard = source[way.blocker] if way.blocker >= 0 else -1
-        if way.side != 0:
-            one.side = way.side * SIDE_STEPS
-        if one.leads:
+        count = _discs(config, given[k], observation[k, first:last], discs, source)
+        at = decode_goal(observation[k, goal : goal + LIDAR_BINS])
+        engaged = ahead or guided[k] != 0
+        leads[k], led, way = _leads(
+            config, discs, count, at, state, proposed[k], not certified[k], engaged, guided[k]
+        )
+        guided[k] = way.side if led else 0
+        hazard[k] = source[way.blocker] if way.blocker >= 0 else -1
+        if leads[k]:
             thrust, turn = steer(config, discs, count, state, way.x, way.y)
-            one.action[0] = thrust * config.robot.force_limit
-            one.action[1] = turn
+            proposed[k, 0] = thrust * config.robot.force_limit
+            proposed[k, 1] = turn

@@ -1,7 +1,17 @@
 """The runtime: policy and multiplier network, the gate, and the decision they end in."""
 
+from guide import DEFAULT_STRENGTH, Strength
 from monitor.errors import MonitorError, NetworkError
 from monitor.gate import GATES, Gate, GateName
 from monitor.monitor import Monitor
 
-__all__ = ["GATES", "Gate", "GateName", "Monitor", "MonitorError", "NetworkError"]
+__all__ = [
+    "DEFAULT_STRENGTH",
+    "GATES",
+    "Gate",
+    "GateName",
+    "Monitor",
+    "MonitorError",
+    "NetworkError",
+    "Strength",
+]

@@ -9,7 +9,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from decision import OpenedBy
+from decision import OpenedBy, texts
 from monitor.errors import MonitorError
 
 FloatArray = NDArray[np.float64]
@@ -50,7 +50,8 @@ class Gate:
             risk: (N,) the risk score; NaN opens the gate.
             low: (N,) whether the barrier is below its floor, see `filter.Scene.low`.
         """
+        n = len(risk)
         if self.name != "risk":
-            return np.full(len(risk), OpenedBy.ALWAYS if self.name == "always" else "", dtype="<U7")
-        by_risk = ~(risk <= self.threshold)
-        return np.where(by_risk, OpenedBy.RISK, np.where(low, OpenedBy.BARRIER, ""))
+            return texts(OpenedBy.ALWAYS if self.name == "always" else "", n)
+        opened = np.where(low, texts(OpenedBy.BARRIER, n), texts("", n))
+        return np.where(risk <= self.threshold, opened, texts(OpenedBy.RISK, n))

@@ -9,18 +9,27 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from decision import MEMORY, SAFE_ACTION, Decision, Decisions, Memory, Mode, OpenedBy, Origin, next_of_plan
+from decision import (
+    MEMORY,
+    SAFE_ACTION,
+    Decision,
+    Decisions,
+    Faults,
+    Memory,
+    Mode,
+    OpenedBy,
+    Origin,
+    fall_back,
+    next_of_plan,
+    texts,
+)
 from filter import BarrierFilter, FilterConfig, FilterInputError, Robot, Scene
 from guide import DEFAULT_STRENGTH, Guide, Strength
 from models import Bundle
 from monitor.errors import MonitorError, NetworkError
-from monitor.faults import Faults
 from monitor.gate import Gate, GateName
-from monitor.networks import FloatArray, Networks
+from monitor.networks import FloatArray, Networks, within
 from pointgoal.observation import layout
-
-_ROUNDING = 1e-6
-_LARGEST = float(np.finfo(np.float32).max)
 
 
 class ActionFilter(Protocol):
@@ -188,25 +197,26 @@ class Monitor:
 
     def _decide(self, observation: FloatArray, hazards: FloatArray | None, memory: Memory) -> Decisions:
         """Networks, gate, filter; raises on whatever cannot be told apart by robot."""
-        self._check_observation(observation)
+        size = self._networks.observation_size
+        if observation.shape[1:] != (size,):
+            raise FilterInputError("observation", f"must have {size} numbers, got {observation.shape[1:]}")
         scene = self._filter.look(observation, hazards)
         nominal, risk = self._networks.run(observation)
-        nominal, sound = self._bound(nominal)
-        sound &= (risk >= 0.0) & (risk < np.inf)
+        sound = np.empty(len(risk), np.bool_)
+        all_sound = within(nominal, self._low, self._high, risk, sound)
         opened_by = self.gate.opened_by(risk, scene.low)
         asked = nominal
-        if not sound.all():
-            opened_by[~sound] = OpenedBy.FAULT
+        if not all_sound:
+            opened_by = np.where(sound, opened_by, texts(OpenedBy.FAULT, len(sound)))
             planned, memory = next_of_plan(memory)
             asked = np.where(sound[:, None], nominal, planned)
         active = opened_by != ""
         decided = self._filter.decide(scene, asked, memory, active)
-        self._check_decided(decided, asked, active)
-        if not sound.all():
+        if decided.action is not asked:
+            self._check_decided(decided, asked, active)
+        if not all_sound:
             decided = self._without_networks(decided, nominal, risk, ~sound)
-        return replace(
-            decided, nominal_action=nominal, risk=risk, threshold=self.gate.threshold, opened_by=opened_by
-        )
+        return decided.told(nominal, risk, self.gate.threshold, opened_by)
 
     def _without_networks(
         self, decided: Decisions, nominal: FloatArray, risk: FloatArray, rows: NDArray[np.bool_]
@@ -223,33 +233,11 @@ class Monitor:
             reason=reason,
         )
 
-    def _bound(self, action: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
-        """Which actions (N, 2) are numbers within the bounds; those have float32's rounding clipped off.
-
-        onnxruntime's tanh, for one, reaches 1.0000001.
-        """
-        clipped = np.minimum(np.maximum(action, self._low), self._high)
-        sound: NDArray[np.bool_] = np.asarray((np.abs(action - clipped) <= _ROUNDING).all(axis=1))
-        return np.where(sound[:, None], clipped, action), sound
-
-    def _check_observation(self, observation: FloatArray) -> None:
-        size = self._networks.observation_size
-        if observation.ndim != 2 or observation.shape[1] != size:
-            raise FilterInputError(
-                "observation", f"must have {size} numbers, got shape {list(observation.shape[1:])}"
-            )
-        good = np.abs(observation) <= _LARGEST  # NaN is not
-        if not good.all():
-            row, column = np.argwhere(~good)[0]
-            raise FilterInputError(f"observation[{column}]", f"is {observation[row, column]}")
-
     def _check_decided(self, decided: Decisions, asked: FloatArray, active: NDArray[np.bool_]) -> None:
         """Trusts no filter: what it answers must be an action, and its mode must be true."""
         action = decided.action
         if action.shape != asked.shape or decided.mode.shape != active.shape:
             raise ValueError(f"the filter gave action {action.shape} and mode {decided.mode.shape}")
-        if action.tobytes() == asked.tobytes():
-            return
         if not ((action >= self._low) & (action <= self._high)).all():
             raise ValueError(f"the filter gave an action outside of its bounds: {action.tolist()}")
         changed = (action.view(np.int64) != asked.view(np.int64)).any(axis=1)
@@ -268,23 +256,7 @@ class Monitor:
         return reason
 
     def _fall_back(self, memory: Memory, reason: str) -> Decisions:
-        """The plans go on for as long as they last; then no barrier falls while the robot coasts."""
-        count = len(memory)
-        action, after = next_of_plan(memory)
-        return Decisions(
-            action=np.where((memory["left"] > 0)[:, None], action, self._safe),
-            nominal_action=np.full((count, 2), np.nan),
-            mode=np.full(count, Mode.FALLBACK),
-            origin=np.full(count, Origin.PLAN),
-            certified=np.zeros(count, np.bool_),
-            barrier=np.full(count, np.nan),
-            hazard=np.full(count, -1),
-            reason=[reason] * count,
-            risk=np.full(count, np.nan),
-            threshold=self.gate.threshold,
-            opened_by=np.full(count, OpenedBy.FAULT),
-            memory=after,
-        )
+        return fall_back(memory, reason, self.gate.threshold, self._safe)
 
     def _warm_up(self) -> None:
         """Runs the networks and every part of the filter once, with and without given hazards.

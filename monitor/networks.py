@@ -5,23 +5,13 @@ from __future__ import annotations
 import numpy as np
 import onnxruntime
 from numpy.typing import NDArray
-from onnxruntime.capi import onnxruntime_pybind11_state as ort_errors
 
 from models import Bundle
 from monitor.errors import NetworkError
+from system.compiled import entry
 
 FloatArray = NDArray[np.float64]
-
-_ORT_FAULTS = (
-    ort_errors.Fail,
-    ort_errors.InvalidArgument,
-    ort_errors.InvalidGraph,
-    ort_errors.InvalidProtobuf,
-    ort_errors.NotImplemented,
-    ort_errors.RuntimeException,
-    RuntimeError,
-    ValueError,
-)
+_ROUNDING = 1e-6
 
 
 class Networks:
@@ -52,14 +42,11 @@ class Networks:
             nominal action [N, 2] and risk score λ_ξ(s) [N] (paper eq. 14).
 
         Raises:
-            NetworkError: if a network fails or gives another shape.
+            NetworkError: if a network gives another shape; whatever onnxruntime raises if it fails.
         """
         feed = {"observation": observation.astype(np.float32)}
-        try:
-            action = self._policy.run(["action"], feed)[0]
-            risk = self._multiplier.run(["multiplier"], feed)[0]
-        except _ORT_FAULTS as error:
-            raise NetworkError(f"onnxruntime: {' '.join(str(error).split())}") from error
+        action = self._policy.run(["action"], feed)[0]
+        risk = self._multiplier.run(["multiplier"], feed)[0]
         expected = len(observation)
         if action.shape != (expected, 2) or risk.shape != (expected,):
             raise NetworkError(
@@ -76,5 +63,30 @@ def _session(graph: bytes, name: str) -> onnxruntime.InferenceSession:
     options.log_severity_level = 3
     try:
         return onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"])
-    except _ORT_FAULTS as error:
+    except Exception as error:
         raise NetworkError(f"{name}: onnxruntime refuses it: {' '.join(str(error).split())}") from error
+
+
+@entry
+def within(
+    action: FloatArray, low: FloatArray, high: FloatArray, risk: FloatArray, sound: NDArray[np.bool_]
+) -> bool:
+    """Which of N actions and scores are numbers within their bounds; whether all are.
+
+    Such an action has float32's rounding clipped off: onnxruntime's tanh, for one, reaches 1.0000001.
+
+    Args:
+        action: [N, a] of the policy; clipped in place where it is sound.
+        low: [a].
+        high: [a].
+        risk: [N], sound from 0 on.
+        sound: [N] receives which are.
+    """
+    for k in range(len(action)):
+        sound[k] = 0.0 <= risk[k] < np.inf
+        for i in range(action.shape[1]):
+            sound[k] &= low[i] - _ROUNDING <= action[k, i] <= high[i] + _ROUNDING
+        for i in range(action.shape[1]):
+            if sound[k]:
+                action[k, i] = min(max(action[k, i], low[i]), high[i])
+    return bool(sound.all())

@@ -12,6 +12,8 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 OPEN_PATHS = frozenset({"/healthz", "/readyz"})
 """What an orchestrator may ask without a key."""
 
+_MAX_DIGITS = 18
+
 
 class BodyTooLargeError(ValueError):
     """A request's body is larger than the limit."""
@@ -42,7 +44,8 @@ class Guard:
             return
         too_large = f"the body must not exceed {self._max_body} bytes"
         stated = headers.get(b"content-length", b"0")
-        if stated.isdigit() and int(stated) > self._max_body:
+        # int() refuses thousands of digits.
+        if stated.isdigit() and (len(stated) > _MAX_DIGITS or int(stated) > self._max_body):
             await _refuse(send, 413, "body", "content-length", too_large)
             return
         received = 0

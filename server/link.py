@@ -11,24 +11,40 @@ import socket
 import time
 from typing import Any
 
+MAX_REPLY = 256 * 1024
+"""Most bytes of a reply, its head included; a real one has one or two thousand."""
+
 
 class DeadlineSocket(socket.socket):
-    """A socket whose reads end at one deadline, however many there are.
+    """A socket whose reads end at one deadline and after so many bytes, however many reads there are.
 
     Attributes:
         deadline: when they end, on the clock of `time.monotonic` [s].
+        allowance: how many bytes may still come.
     """
 
     deadline = 0.0
+    allowance = 0
 
     def recv_into(self, *arguments: Any) -> int:
-        """Reads what is there, or raises TimeoutError once the deadline has passed."""
+        """Reads what is there.
+
+        Raises:
+            TimeoutError: once the deadline has passed.
+            http.client.HTTPException: once more has come than is allowed.
+        """
         self.settimeout(remaining(self.deadline))
-        return super().recv_into(*arguments)
+        count = super().recv_into(*arguments)
+        self.allowance -= count
+        if self.allowance < 0:
+            raise http.client.HTTPException(f"the reply has more than {MAX_REPLY} bytes")
+        return count
 
 
 class Link:
     """A connection that is opened when needed, kept, and opened anew after any fault.
+
+    The host's name is looked up once, by the first exchange: a look-up knows no deadline.
 
     Args:
         host: whom to connect to.
@@ -40,6 +56,7 @@ class Link:
         self._address = (host, port)
         name = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
         self._headers = "".join(f"{key}: {value}\r\n" for key, value in {"host": name, **headers}.items())
+        self._addresses: list[tuple[Any, ...]] = []
         self._socket: DeadlineSocket | None = None
 
     def exchange(self, method: str, path: str, body: bytes, timeout: float) -> tuple[int, bytes]:
@@ -57,7 +74,8 @@ class Link:
         Raises:
             TimeoutError: if it takes longer.
             OSError: if the connection fails.
-            http.client.HTTPException: if the reply is not HTTP.
+            http.client.HTTPException: if the reply is not HTTP, does not state its length, or is longer than
+                `MAX_REPLY`.
         """
         deadline = time.monotonic() + timeout
         kept = self._socket is not None
@@ -80,11 +98,15 @@ class Link:
         head = f"{method} {path} HTTP/1.1\r\n{self._headers}content-length: {len(body)}\r\n\r\n"
         try:
             opened = self._socket or self._connect(deadline)
-            opened.deadline = deadline
+            opened.deadline, opened.allowance = deadline, MAX_REPLY
             opened.settimeout(remaining(deadline))
             opened.sendall(head.encode("latin-1") + body)
             response = http.client.HTTPResponse(opened, method=method)
             response.begin()
+            # The service states the length of whatever it sends. What does not is not read: a chunk may
+            # claim any size.
+            if response.length is None or response.length > MAX_REPLY:
+                raise http.client.HTTPException("the reply states no length that a reply can have")
             content = response.read()
         except BaseException:
             # Half an exchange may be left in it: the next reply would be the answer to this request. Also on
@@ -96,17 +118,33 @@ class Link:
         return response.status, content
 
     def _connect(self, deadline: float) -> DeadlineSocket:
-        family, kind, protocol, _, address = socket.getaddrinfo(*self._address, type=socket.SOCK_STREAM)[0]
-        opened = DeadlineSocket(family, kind, protocol)
-        try:
-            opened.settimeout(remaining(deadline))
-            opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            opened.connect(address)
-        except OSError:
-            opened.close()
-            raise
-        self._socket = opened
-        return opened
+        """Opens a connection to the first of the host's addresses that answers: "localhost" often has two."""
+        if not self._addresses:
+            self._addresses = list(socket.getaddrinfo(*self._address, type=socket.SOCK_STREAM))
+        fault: OSError | None = None
+        for k, found in enumerate(self._addresses):
+            try:
+                self._socket = _open(found, remaining(deadline) / (len(self._addresses) - k))
+            except OSError as error:
+                fault = error
+                continue
+            # Asked first the next time.
+            self._addresses.sort(key=lambda address: address != found)
+            return self._socket
+        raise fault or OSError("the host has no address")
+
+
+def _open(found: tuple[Any, ...], timeout: float) -> DeadlineSocket:
+    family, kind, protocol, _, address = found
+    opened = DeadlineSocket(family, kind, protocol)
+    try:
+        opened.settimeout(timeout)
+        opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        opened.connect(address)
+    except BaseException:
+        opened.close()
+        raise
+    return opened
 
 
 def remaining(deadline: float) -> float:

@@ -1,23 +1,49 @@
-"""What goes over the wire. No field of a reply can hold NaN or Inf: what is unknown is null."""
+"""What goes over the wire. No field of a reply can hold NaN or Inf: what is unknown is null.
+
+The client reads this file as well, so it needs neither the monitor nor the bundles.
+"""
 
 from __future__ import annotations
 
 import math
-from typing import Annotated, Self
+from collections.abc import Callable
+from dataclasses import fields
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, Self, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, create_model
 
-from models import Bundle, ObservationBlock
-from monitor import SAFE_ACTION, Decision, Gate, ModeName, Monitor, memory_to_json
+from decision import PLAN_STEPS, Decision, Mode, OpenedBy, Origin, memory_from_json, memory_to_json
+
+if TYPE_CHECKING:
+    from monitor import Monitor
+
+FloatArray = NDArray[np.float64]
 
 Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 """A JSON number; not a string, not a bool, not NaN or Inf in any spelling."""
 Pair = Annotated[list[Finite], Field(min_length=2, max_length=2)]
-MemoryJson = dict[str, list[Finite]]
+RequestNumber = Annotated[int, Field(strict=True, ge=0, lt=2**63)]
 MAX_HAZARDS = 1000
 """Most hazards a request may name."""
+
+
+class MemoryJson(BaseModel):
+    """One robot's memory; `decision.memory_to_json` writes it and `decision.memory_from_json` reads it.
+
+    Attributes:
+        side: the side on which the robot passes what is in its way, and for how long that is remembered.
+        guided: whether the guide leads.
+        plan: what is left of the certified plan: the actions that are safe to send next, one a control step,
+            if no further reply comes; after them the robot coasts.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+    side: int
+    guided: int
+    plan: Annotated[list[Pair], Field(max_length=PLAN_STEPS)]
 
 
 class ActRequest(BaseModel):
@@ -27,7 +53,8 @@ class ActRequest(BaseModel):
         observation: the numbers of the bundle's observation layout, in its order.
         hazards: centres of the hazards in the body frame [m], x ahead, y left; left out, the lidar is
             decoded.
-        memory: the `memory` of this robot's last reply, unchanged; it may be left out.
+        memory: the `memory` of this robot's last reply, unchanged; left out before its first step.
+        request: any whole number; the reply repeats it, so that its sender knows which request it answers.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -35,80 +62,142 @@ class ActRequest(BaseModel):
     observation: Annotated[list[Finite], Field(min_length=1)]
     hazards: Annotated[list[Pair], Field(max_length=MAX_HAZARDS)] | None = None
     memory: MemoryJson | None = None
+    request: RequestNumber = 0
 
 
-class ActReply(BaseModel):
-    """The reply of `POST /act`.
+class Reply(BaseModel):
+    """What a reply of `POST /act` says beside the decision.
 
     Attributes:
-        action: what to send to the robot.
-        nominal_action: the policy's action; null if it gave no number.
-        risk: the risk score λ_ξ(s); null if the multiplier network gave no number.
-        threshold: the gate `risk` activates the filter where risk is above this.
-        mode: nominal, filtered or fallback.
-        barrier: h [m], ≥ 0 is safe, at most the lidar's range; null if it could not be computed.
-        hazard: index of the hazard that caused the intervention.
-        row: label of the QP's row that caused it.
-        reason: why the mode is fallback.
         gate_open: whether the filter was active.
-        model: the bundle's id; null in a reply that the client made itself.
+        gate: when the filter is active: risk, always, off.
+        model: the bundle's id.
+        request: the request's number.
         seconds: how long the decision took [s].
-        memory: to be sent back with this robot's next observation, if it likes.
     """
 
-    model_config = ConfigDict(frozen=True)
+    model_config = ConfigDict(frozen=True, strict=True)
 
-    action: Pair
-    nominal_action: Pair | None
-    risk: Finite | None
-    threshold: Finite | None
-    mode: ModeName
-    barrier: Finite | None
-    hazard: int | None
-    row: str | None
-    reason: str | None
     gate_open: bool
-    model: str | None
+    gate: str
+    model: str
+    request: RequestNumber
     seconds: Finite
-    memory: MemoryJson | None
 
-    @classmethod
-    def of(cls, decision: Decision, model: str, seconds: float) -> Self:
-        """The reply that tells a decision."""
-        return cls(
-            action=decision.action.tolist(),
-            nominal_action=_finite_pair(decision.nominal_action),
-            risk=_finite(decision.risk),
-            threshold=decision.threshold,
-            mode=decision.mode,
-            barrier=_finite(decision.barrier),
-            hazard=decision.hazard,
-            row=decision.row,
-            reason=decision.reason,
-            gate_open=decision.gate_open,
-            model=model,
-            seconds=seconds,
-            memory=memory_to_json(decision.memory),
-        )
 
-    @classmethod
-    def safe(cls, reason: str, seconds: float) -> Self:
-        """The reply that the client makes itself when it got none: zero thrust."""
-        return cls(
-            action=list(SAFE_ACTION),
-            nominal_action=None,
-            risk=None,
-            threshold=None,
-            mode="fallback",
-            barrier=None,
-            hazard=None,
-            row=None,
-            reason=reason,
-            gate_open=True,
-            model=None,
-            seconds=seconds,
-            memory=None,
-        )
+class Wire(NamedTuple):
+    """How a field of `Decision` goes over the wire."""
+
+    kind: Any
+    """Its type there."""
+    write: Callable[[Any], Any] | None = None
+    """From the decision's value; None: as it is."""
+    read: Callable[[Any], Any] | None = None
+    """To the decision's value; None: as it is."""
+
+
+def _finite(number: float) -> float | None:
+    return number if math.isfinite(number) else None
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else value
+
+
+def _finite_pair(pair: FloatArray) -> list[float] | None:
+    numbers: list[float] = pair.tolist()
+    return numbers if all(map(math.isfinite, numbers)) else None
+
+
+def _pair(value: list[float] | None) -> FloatArray:
+    return np.full(2, np.nan) if value is None else np.array(value, np.float64)
+
+
+def _memory(value: MemoryJson) -> np.void:
+    memory: np.void = memory_from_json(value.model_dump())[0]
+    return memory
+
+
+_AS_IT_IS = (Mode, bool, Origin | None, OpenedBy | None, int | None, str | None)
+_WIRE: dict[Any, Wire] = {
+    FloatArray: Wire(Pair | None, _finite_pair, _pair),
+    float: Wire(Finite | None, _finite, _number),
+    np.void: Wire(MemoryJson, memory_to_json, _memory),
+    **{kind: Wire(kind) for kind in _AS_IT_IS},
+}
+"""A field's type in `Decision` → how it goes over the wire."""
+
+
+def _wires() -> dict[str, Wire]:
+    """How every field of `Decision` goes over the wire.
+
+    Raises:
+        TypeError: if it has a field of a type for which that is not settled.
+    """
+    kinds = get_type_hints(Decision)
+    wires = {}
+    for field in fields(Decision):
+        if kinds[field.name] not in _WIRE:
+            raise TypeError(f"Decision.{field.name} has a type that the wire does not know")
+        wires[field.name] = _WIRE[kinds[field.name]]
+    # Whatever else is unknown, a robot is never sent an action that is none.
+    return wires | {"action": wires["action"]._replace(kind=Pair)}
+
+
+_FIELDS = _wires()
+_DEFINITIONS: dict[str, Any] = {name: (wire.kind, ...) for name, wire in _FIELDS.items()}
+
+ActReply = create_model(
+    "ActReply",
+    __base__=Reply,
+    __doc__="The reply of `POST /act`: the fields of `decision.Decision`, and those of `Reply`.",
+    **_DEFINITIONS,
+)
+
+
+def reply_of(decision: Decision, request: int, model: str, gate: str, seconds: float) -> Reply:
+    """The `ActReply` that tells a decision.
+
+    Raises:
+        pydantic.ValidationError: if its action is no action.
+    """
+    told: dict[str, Any] = {}
+    for name, wire in _FIELDS.items():
+        value = getattr(decision, name)
+        told[name] = value if wire.write is None else wire.write(value)
+    reply: Reply = ActReply(
+        **told, gate_open=decision.gate_open, gate=gate, model=model, request=request, seconds=seconds
+    )
+    return reply
+
+
+def decision_of(reply: Reply) -> Decision:
+    """The decision that an `ActReply` tells.
+
+    Raises:
+        ValueError: if its memory is none.
+    """
+    told = {}
+    for name, wire in _FIELDS.items():
+        value = getattr(reply, name)
+        told[name] = value if wire.read is None else wire.read(value)
+    return Decision(**told)
+
+
+class Block(BaseModel):
+    """One named run of numbers in the observation, as in `pointgoal.observation.Block`.
+
+    Attributes:
+        name: the sensor.
+        start: index of its first number.
+        size: how many numbers.
+        unit: their unit; "1" for dimensionless readings.
+    """
+
+    name: str
+    start: int
+    size: int
+    unit: str
 
 
 class ModelReply(BaseModel):
@@ -125,9 +214,12 @@ class ModelReply(BaseModel):
         action_low: lower bounds of the action.
         action_high: upper bounds of the action.
         hazard_radius: radius of a hazard [m].
+        robot: the robot's constants, name → number, as `system.Robot` names them.
         gate: when the filter is active: risk, always, off.
         threshold: the gate `risk` activates the filter where the risk score is above this.
         threshold_source: how the bundle's threshold was set.
+        floor: the gate `risk` activates the filter where the barrier is below this [m].
+        guide: how much the guide may do: off, refusal, ahead.
     """
 
     model: str
@@ -136,40 +228,39 @@ class ModelReply(BaseModel):
     algorithm: str
     sha256: dict[str, str]
     observation_size: int
-    observation_layout: list[ObservationBlock]
+    observation_layout: list[Block]
     action_low: Pair
     action_high: Pair
     hazard_radius: Finite
-    gate: Gate
+    robot: dict[str, Finite]
+    gate: str
     threshold: Finite
     threshold_source: str
+    floor: Finite
+    guide: str
 
     @classmethod
     def of(cls, monitor: Monitor) -> Self:
         """The reply that tells what a monitor runs."""
-        bundle: Bundle = monitor.bundle
-        manifest = bundle.manifest
-        overridden = monitor.threshold != manifest.threshold
+        manifest = monitor.bundle.manifest
+        gate, robot = monitor.gate, monitor._filter.config.robot
+        guide = getattr(monitor._filter, "guide", None)
+        overridden = gate.threshold != manifest.threshold
         return cls(
-            model=bundle.id,
+            model=monitor.bundle.id,
             task=manifest.task,
             level=manifest.level,
             algorithm=manifest.algorithm,
             sha256=dict(manifest.sha256.items()),
             observation_size=manifest.observation_size,
-            observation_layout=list(manifest.observation_layout),
+            observation_layout=[Block(**block.model_dump()) for block in manifest.observation_layout],
             action_low=list(manifest.action_low),
             action_high=list(manifest.action_high),
             hazard_radius=manifest.hazard_radius,
-            gate=monitor.gate,
-            threshold=monitor.threshold,
+            robot={} if robot is None else robot._asdict(),
+            gate=gate.name,
+            threshold=gate.threshold,
             threshold_source="set when the service was started" if overridden else manifest.threshold_source,
+            floor=gate.floor,
+            guide=getattr(guide, "strength", "off"),
         )
-
-
-def _finite(number: float) -> float | None:
-    return number if math.isfinite(number) else None
-
-
-def _finite_pair(pair: NDArray[np.float64]) -> list[float] | None:
-    return pair.tolist() if np.isfinite(pair).all() else None

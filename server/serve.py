@@ -20,7 +20,7 @@ from rich.console import Console
 from starlette.types import ASGIApp
 
 from models import BundleError
-from monitor import Gate, Monitor, MonitorError
+from monitor import DEFAULT_STRENGTH, GateName, Monitor, MonitorError, Strength
 from server.app import MAX_BODY, Lifecycle, create_app
 
 KEY_VARIABLE = "LAGNET_API_KEY"
@@ -49,10 +49,12 @@ class ServeConfig:
     """Address to listen on. Beyond loopback a key is required."""
     port: int = 8000
     """Port to listen on; 0 takes a free one."""
-    gate: Gate = "risk"
-    """When the filter is active: where the risk score exceeds the threshold, always, never."""
+    gate: GateName = "risk"
+    """When the filter is active: where the risk score or the barrier asks for it, always, never."""
     threshold: float | None = None
     """Risk score above which the gate `risk` activates the filter; by default the bundle's."""
+    guide: Strength = DEFAULT_STRENGTH
+    """How much the guide may do: nothing, lead on from a refused action on, or lead ahead."""
     api_key_file: Path | None = None
     """File that holds the key; otherwise the environment variable LAGNET_API_KEY."""
     max_body: int = MAX_BODY
@@ -165,13 +167,14 @@ def serve(config: ServeConfig) -> None:
     api_key = read_api_key(config.api_key_file)
     listener = listen(config.host, config.port, api_key)
     with listener:
-        monitor = Monitor.load(config.bundle, config.gate, config.threshold)
+        monitor = Monitor.load(config.bundle, config.gate, config.threshold, guide=config.guide)
         lifecycle = Lifecycle()
         app = create_app(monitor, lifecycle, api_key, config.max_body)
         host, port = listener.getsockname()[:2]
         url = f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
         ready = {"event": "listening", "url": url, "host": host, "port": port, "model": monitor.bundle.id}
-        announcement = json.dumps(ready | {"gate": monitor.gate, "threshold": monitor.threshold})
+        gate = {"gate": monitor.gate.name, "threshold": monitor.gate.threshold, "guide": config.guide}
+        announcement = json.dumps(ready | gate)
         _server(app, lifecycle, config, announcement).run(sockets=[listener])
 
 

@@ -13,7 +13,7 @@ import numba
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
-_ROOMS = ("decision", "system", "filter", "guide")
+_ROOMS = ("decision", "system", "filter", "guide", "monitor")
 """The rooms that hold compiled code, and what goes into it."""
 
 

@@ -8,6 +8,8 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.vector import VectorEnv
 
+from pointgoal.loop import drive, groups
+
 Policy = Callable[[npt.NDArray[np.float32]], npt.NDArray[np.float32]]
 
 
@@ -49,27 +51,17 @@ def episodes(env: VectorEnv[Any, Any, Any], policy: Policy, seeds: Sequence[int]
         The E episodes, in the seeds' order.
     """
     count = len(seeds)
-    # Rows to spare in the last batch repeat the first episodes, and are dropped.
-    rows = np.arange(-(-count // env.num_envs) * env.num_envs).reshape(-1, env.num_envs) % count
-    parts = [_batch(env, policy, steps, [seeds[i] for i in batch]) for batch in rows]
-    reward, cost, observation = (np.concatenate(part, axis=1)[:, :count] for part in zip(*parts, strict=True))
-    return Episodes(reward, cost, observation)
+    reward = np.full((steps, count), np.nan)
+    cost = np.full((steps, count), np.nan)
+    seen = np.full((steps, count, *env.single_observation_space.shape), np.nan, np.float32)  # type: ignore[misc]
 
+    def act(observation: npt.NDArray[Any], _: Any) -> npt.NDArray[np.float32]:
+        return policy(observation.astype(np.float32))
 
-def _batch(
-    env: Any, policy: Policy, steps: int, seeds: list[int]
-) -> tuple[npt.NDArray[Any], npt.NDArray[Any], npt.NDArray[Any]]:
-    observation, _ = env.reset(seed=seeds)
-    reward = np.full((steps, env.num_envs), np.nan)
-    cost = np.full((steps, env.num_envs), np.nan)
-    seen = np.full((steps, *observation.shape), np.nan, np.float32)
-    going = np.ones(env.num_envs, np.bool_)
-    for t in range(steps):
-        seen[t, going] = observation[going]
-        observation, r, terminated, truncated, info = env.step(policy(observation.astype(np.float32)))
-        # Where an algorithm constrains something else, the task's own cost stands beside it.
-        reward[t, going], cost[t, going] = r[going], info.get("task_cost", info["cost"])[going]
-        going &= ~(terminated | truncated)
-        if not going.any():
-            break
-    return reward, cost, seen
+    for part in groups(count, env.num_envs):
+        for t, step in enumerate(drive(env, act, seeds[part], steps)):
+            rows = np.flatnonzero(step.running)
+            there = part.start + rows
+            reward[t, there], cost[t, there] = step.reward[rows], step.cost[rows]
+            seen[t, there] = step.observation[rows]
+    return Episodes(reward, cost, seen)

@@ -1,18 +1,15 @@
-"""Episodes add up to what single environments give, and the service decides as the monitor in process."""
+"""Episodes add up to what single environments and single decisions give."""
 
 from __future__ import annotations
-
-from pathlib import Path
 
 import gymnasium
 import numpy as np
 import pytest
 
+from decision import Mode, OpenedBy, Origin
 from evaluation.closed_loop import TaskError, run_episodes
-from evaluation.deciders import OverHttp
-from evaluation.service import Service
-from filter import Mode
-from pointgoal.observation import HAZARD_RADIUS, layout
+from monitor import Monitor
+from pointgoal.observation import HAZARD_RADIUS
 from pointgoal.seeds import Use, rows
 
 
@@ -30,6 +27,27 @@ def test_each_episode_is_that_of_a_single_environment(full_thrust) -> None:
         assert full_thrust.violating_steps[i] == violating
 
 
+@pytest.mark.parametrize("hazards", ["lidar", "given"])
+def test_the_loop_decides_as_a_robot_alone_would(always, hazards) -> None:
+    """One robot's own loop, `decide` by `decide` with its memory, is a row of the many."""
+    many = run_episodes("PointGoal1-v0", always, 2, seed=2, hazards=hazards, record=True)
+    env = gymnasium.make("PointGoal1-v0").unwrapped
+    observation, _ = env.reset(seed=rows(Use.EVALUATION, 2, 2)[1])
+    memory, total, counts = None, 0.0, dict.fromkeys(Origin, 0)
+    for t in range(1000):
+        given = env.hazards_in_body_frame() if hazards == "given" else None
+        decision = always.decide(observation, given, memory)
+        memory = decision.memory
+        np.testing.assert_allclose(decision.action, many.trajectory.action[t, 1], atol=1e-5)
+        observation, reward, *_ = env.step(decision.action)
+        total += reward
+        if decision.origin is not None:
+            counts[decision.origin] += 1
+    assert total == pytest.approx(many.returns[1], abs=1e-3)
+    assert counts == {origin: count[1] for origin, count in many.origins.items()}
+    assert sum(counts.values()) > 0
+
+
 def test_the_recording_tells_the_same(full_thrust) -> None:
     recorded = full_thrust.trajectory
     assert recorded.pose.shape == (1000, 3, 3)
@@ -40,28 +58,65 @@ def test_the_recording_tells_the_same(full_thrust) -> None:
     depth = np.maximum(HAZARD_RADIUS - gaps, 0.0).sum(axis=-1)
     np.testing.assert_allclose(recorded.cost[:-1], depth, atol=1e-9)
     assert (recorded.mode[9::10] == Mode.FALLBACK).all()
+    for cause, count in full_thrust.opened_by.items():
+        np.testing.assert_array_equal((recorded.opened_by == cause).sum(axis=0), count)
 
 
-def test_the_service_decides_as_the_monitor(tiny_bundle: Path, always) -> None:
-    here = run_episodes("PointGoal1-v0", always, 3, seed=1, hazards="lidar", record=True)
-    with (
-        Service.start(tiny_bundle, "always") as service,
-        OverHttp(service.url, layout(1).to_json(), 5.0) as robots,
+def test_what_is_counted_is_what_was_decided(full_thrust) -> None:
+    """The script of conftest: 1000 steps an episode."""
+    steps = np.arange(1, 1001)
+    fallback, filtered = steps % 10 == 0, (steps % 5 == 0) & (steps % 10 != 0)
+    guided = (steps % 3 == 0) & (steps % 5 != 0)
+    risk = fallback | guided | ((steps % 2 == 1) & ~filtered)
+    for kind, expected in (
+        (full_thrust.modes[Mode.FALLBACK], fallback),
+        (full_thrust.modes[Mode.FILTERED], filtered),
+        (full_thrust.modes[Mode.GUIDED], guided),
+        (full_thrust.origins[Origin.PLAN], fallback),
+        (full_thrust.origins[Origin.BARRIER], filtered),
+        (full_thrust.origins[Origin.GUIDE], guided),
+        (full_thrust.origins[Origin.HARM], np.zeros(1000)),
+        (full_thrust.opened_by[OpenedBy.RISK], risk),
+        (full_thrust.opened_by[OpenedBy.BARRIER], filtered),
+        (full_thrust.opened_by[OpenedBy.ALWAYS], np.zeros(1000)),
+        (full_thrust.certified_replaced, guided),
+        (full_thrust.open_steps, risk | filtered),
+        (full_thrust.interventions, fallback | filtered | guided),
     ):
-        there = run_episodes("PointGoal1-v0", robots, 3, seed=1, hazards="lidar", record=True)
-    assert len(there.seconds) == 3000
-    assert (here.modes[:, Mode.FILTERED] + here.modes[:, Mode.FALLBACK]).sum() > 0
-    np.testing.assert_array_equal(here.modes, there.modes)
-    np.testing.assert_array_equal(here.trajectory.action, there.trajectory.action)
-    np.testing.assert_array_equal(here.returns, there.returns)
+        assert kind.tolist() == [expected.sum()] * 3
+
+
+@pytest.mark.parametrize("gate", ["off", "risk", "always"])
+def test_counts_add_up_for_a_real_monitor(tiny_bundle, gate) -> None:
+    episodes = run_episodes("PointGoal1-v0", Monitor.load(tiny_bundle, gate), 2, seed=3)
+    np.testing.assert_array_equal(sum(episodes.origins.values()), episodes.interventions)
+    np.testing.assert_array_equal(sum(episodes.modes.values()), episodes.steps)
+    np.testing.assert_array_equal(sum(episodes.opened_by.values()), episodes.open_steps)
+    assert (episodes.certified_replaced <= episodes.interventions).all()
+    assert (episodes.interventions <= episodes.open_steps).all()
+    if gate != "risk":
+        np.testing.assert_array_equal(episodes.open_steps, episodes.steps * (gate == "always"))
+
+
+def test_a_decision_is_timed_as_one_robot_calls_it(scripted, monkeypatch) -> None:
+    monkeypatch.setattr("evaluation.closed_loop._TIMED_STATES", 40)
+    decider = scripted()
+    episodes = run_episodes("PointGoal1-v0", decider, 2, hazards="given")
+    assert decider.singles == 41  # the first one, which may have to connect, is not timed
+    assert len(episodes.seconds) == 40
+    assert min(episodes.seconds) > 0.0
 
 
 def test_more_episodes_than_fit_side_by_side(always, monkeypatch) -> None:
     whole = run_episodes("PointGoal1-v0", always, 3, seed=4)
     monkeypatch.setattr("evaluation.closed_loop.SIDE_BY_SIDE", 2)
-    parts = run_episodes("PointGoal1-v0", always, 3, seed=4)
+    steps = []
+    parts = run_episodes("PointGoal1-v0", always, 3, seed=4, progress=steps.append)
     np.testing.assert_allclose(whole.returns, parts.returns, atol=1e-9)
-    assert len(parts.seconds) > len(whole.seconds) > 0
+    for mode in Mode:
+        np.testing.assert_array_equal(whole.modes[mode], parts.modes[mode])
+    assert sum(steps) == parts.steps.sum() == 3000
+    assert len(parts.seconds) == len(whole.seconds) == 1000
     with pytest.raises(ValueError, match="recorded"):
         run_episodes("PointGoal1-v0", always, 3, record=True)
 
@@ -70,3 +125,8 @@ def test_more_episodes_than_fit_side_by_side(always, monkeypatch) -> None:
 def test_a_task_that_is_not_ours_is_refused(task: str, always) -> None:
     with pytest.raises(TaskError, match=task):
         run_episodes(task, always, 1)
+
+
+def test_no_episode_is_none(always) -> None:
+    with pytest.raises(ValueError, match="at least 1"):
+        run_episodes("PointGoal1-v0", always, 0)

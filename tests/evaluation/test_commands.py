@@ -1,19 +1,22 @@
-"""`lagnet-evaluate` and the demo as they are typed, and that nothing they start outlives them."""
+"""`lagnet-evaluate` as it is typed, and the demo's pictures."""
 
 from __future__ import annotations
 
 import json
-import os
-import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
+import numpy as np
 import pytest
+from matplotlib import image
 from PIL import Image
+from rich.console import Console
 
-from evaluation.service import Service, ServiceError
+from decision import Mode, OpenedBy
+from evaluation import demo
+from evaluation.closed_loop import run_episodes
+from evaluation.pictures import draw_drives, drive
 
 
 def command(module: str, *arguments: object) -> subprocess.CompletedProcess[str]:
@@ -26,102 +29,114 @@ def command(module: str, *arguments: object) -> subprocess.CompletedProcess[str]
     )
 
 
-def services_of(bundle: Path) -> list[int]:
-    """Processes that serve a bundle."""
-    found = []
-    for folder in Path("/proc").iterdir():
-        if folder.name.isdigit():
-            try:
-                words = (folder / "cmdline").read_bytes().split(b"\0")
-            except OSError:
-                continue
-            if b"server.serve" in words and str(bundle).encode() in words:
-                found.append(int(folder.name))
-    return found
-
-
-def test_evaluate_prints_a_table_and_writes_the_figures(tiny_bundle: Path, tmp_path: Path) -> None:
+def test_evaluate_prints_tables_and_writes_the_figures(tiny_bundle: Path, tmp_path: Path) -> None:
     figures = tmp_path / "figures.json"
-    result = command(
-        "evaluation.evaluate", tiny_bundle, "--episodes", 2, "--gate", "always", "--json", figures
-    )
+    asked = ("--episodes", 2, "--gate", "always", "--guide", "off", "--hazards", "both", "--seed", 1)
+    result = command("evaluation.evaluate", tiny_bundle, *asked, "--json", figures)
     assert result.returncode == 0, result.stderr
-    for words in ("return", "violating steps", "95 % interval", "interventions", "decision p50 / p99"):
-        assert words in result.stdout
+    words = ("return", "violating", "95 %", "gate open", "interventions", "p50 / p99", "lidar alone", "given")
+    for word in words:
+        assert word in result.stdout
+    assert max(map(len, result.stdout.splitlines())) <= 100
     content = json.loads(figures.read_text())
-    assert content["asked"]["episodes"] == content["summary"]["episodes"] == 2
+    assert content["asked"]["episodes"] == 2
     assert content["decided_by"]["gate"] == "always"
-    assert sum(content["each_episode"]["return"]) / 2 == pytest.approx(content["summary"]["return_mean"])
+    assert content["decided_by"]["guide"] == "off"
+    assert set(content["hazards"]) == {"lidar", "given"}
+    for source in content["hazards"].values():
+        summary, each = source["summary"], source["each_episode"]
+        assert sum(each["return"]) / 2 == pytest.approx(summary["return_mean"])
+        assert sum(each["open_steps"]) == summary["opened_by"]["always"] == summary["steps"] == 2000
+        assert sum(each["interventions"]) == summary["interventions"] > 0
+        assert summary["origins"]["guide"] == 0
 
 
-def test_evaluate_says_in_one_line_what_is_wrong(tiny_bundle: Path) -> None:
-    result = command("evaluation.evaluate", tiny_bundle, "--url", "http://127.0.0.1:1")
+def test_by_default_the_filter_knows_what_the_task_promises(tiny_bundle: Path, tmp_path: Path) -> None:
+    figures = tmp_path / "figures.json"
+    result = command("evaluation.evaluate", tiny_bundle, "--episodes", 1, "--json", figures)
+    assert result.returncode == 0, result.stderr
+    content = json.loads(figures.read_text())
+    assert set(content["hazards"]) == {"lidar"}
+    assert content["decided_by"]["guide"] == "refusal"
+    assert content["decided_by"]["threshold"] == 0.5
+
+
+WRONG = [("--episodes", 0), ("--seed", -1), ("--timeout", "nan")]
+
+
+@pytest.mark.parametrize(
+    ("module", "wrong"),
+    [
+        *(("evaluation.evaluate", wrong) for wrong in [*WRONG, ("--json", "/nowhere/at/all.json")]),
+        *(("evaluation.demo", wrong) for wrong in WRONG),
+    ],
+)
+def test_what_cannot_be_run_is_one_line(tiny_bundle: Path, tmp_path: Path, module: str, wrong) -> None:
+    result = command(module, tiny_bundle, *wrong, *(("--out", tmp_path) if "demo" in module else ()))
     assert (result.returncode, result.stdout.strip()) == (2, "")
-    (line,) = result.stderr.strip().splitlines()
-    assert "http://127.0.0.1:1" in line
-
-
-def test_a_gate_that_is_not_the_services_is_refused(tiny_bundle: Path, monkeypatch) -> None:
-    # A key of the user's own services is none of this one's.
-    monkeypatch.setenv("LAGNET_API_KEY", "sesame")
-    with Service.start(tiny_bundle, "off") as service:
-        asked = ("evaluation.evaluate", tiny_bundle, "--url", service.url)
-        for given, named in ((("--gate", "always"), "gate off"), (("--threshold", "0.1"), "threshold 0.5")):
-            result = command(*asked, *given)
-            assert result.returncode == 2
-            assert named in result.stderr
-
-
-@pytest.mark.parametrize("wrong", [("--episodes", 0), ("--seed", -1), ("--timeout", "nan")])
-def test_a_demo_that_cannot_be_run_is_one_line(tiny_bundle: Path, tmp_path: Path, wrong) -> None:
-    result = command("evaluation.demo", tiny_bundle, "--out", tmp_path, *wrong)
-    assert result.returncode == 2
     (line,) = result.stderr.strip().splitlines()
     assert wrong[0] in line
 
 
-def test_the_demo_leaves_a_table_a_picture_and_an_animation(tiny_bundle: Path, tmp_path: Path) -> None:
-    out = tmp_path / "demo"
-    result = command("evaluation.demo", tiny_bundle, "--out", out, "--episodes", 1)
-    assert result.returncode == 0, result.stderr
+@pytest.fixture
+def shown(scripted, tmp_path: Path):
+    """What the demo leaves of scripted robots."""
+
+    def closed(step: int):
+        return Mode.NOMINAL, "", "", False
+
+    def always(step: int):
+        mode, origin, _, certified = scripted().says(step)
+        return mode, origin, OpenedBy.ALWAYS, certified
+
+    says = {"off": closed, "risk": None, "always": always}
+    runs = {
+        gate: run_episodes(
+            "PointGoal1-v0", scripted((1.0, 0.1 if gate == "always" else 0.25), say), 2, record=True
+        )
+        for gate, say in says.items()
+    }
+    demo.show(runs, tmp_path, 0.5, "two episodes", Console(quiet=True))
+    return runs, tmp_path
+
+
+def test_the_demo_leaves_a_table_a_picture_and_an_animation(shown) -> None:
+    runs, out = shown
     assert "gate risk" in (out / "table.txt").read_text()
-    assert set(json.loads((out / "summary.json").read_text())) == {"off", "risk", "always"}
+    assert set(json.loads((out / "summary.json").read_text())) == set(demo.GATES) == set(runs)
     with Image.open(out / "episode.png") as picture:
         assert min(picture.size) > 800
     with Image.open(out / "episode.gif") as animation:
         assert animation.n_frames > 50
     assert (out / "episode.gif").stat().st_size < 2_000_000
-    assert services_of(tiny_bundle) == []
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_an_interrupted_demo_stops_its_service(
-    own_bundle: Path, tmp_path: Path, number: signal.Signals
-) -> None:
-    demo = subprocess.Popen(
-        [sys.executable, "-m", "evaluation.demo", str(own_bundle), "--out", str(tmp_path / "demo")],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    try:
-        deadline = time.monotonic() + 60.0
-        while not services_of(own_bundle):
-            assert demo.poll() is None, demo.stderr.read()
-            assert time.monotonic() < deadline
-            time.sleep(0.05)
-        demo.send_signal(number)
-        assert demo.wait(30.0) == 130
-        assert "Traceback" not in demo.stderr.read()
-        assert services_of(own_bundle) == []
-    finally:
-        demo.kill()
-        demo.wait()
-        for left in services_of(own_bundle):
-            os.kill(left, signal.SIGKILL)
+def colours_of(path: Path) -> set[str]:
+    """Those that a picture has more than a few points of."""
+    pixels = np.round(image.imread(path)[..., :3] * 255).astype(np.uint8).reshape(-1, 3)
+    colours, counts = np.unique(pixels, axis=0, return_counts=True)
+    return {f"#{r:02x}{g:02x}{b:02x}" for (r, g, b), count in zip(colours, counts, strict=True) if count > 30}
 
 
-def test_a_service_that_does_not_start_tells_why(own_bundle: Path) -> None:
-    (own_bundle / "policy.onnx").unlink()
-    with pytest.raises(ServiceError, match=r"policy\.onnx"):
-        Service.start(own_bundle, "off")
+def test_the_picture_shows_what_opened_the_gate_and_what_was_sent(shown, tmp_path: Path) -> None:
+    runs, _ = shown
+    drives = {gate: drive(episodes.trajectory, 0) for gate, episodes in runs.items()}
+    risk, barrier, always = "#7b2cbf", "#70a80b", "#0077b6"
+    filtered, guided = "#f48c06", "#4cc9f0"
+    draw_drives(tmp_path / "all.png", drives, 0.5, "all")
+    assert {risk, barrier, always, filtered, guided} <= colours_of(tmp_path / "all.png")
+    draw_drives(tmp_path / "off.png", {"off": drives["off"]}, 0.5, "off")
+    assert not {barrier, always} & colours_of(tmp_path / "off.png")
+
+
+def test_the_picture_of_gates_that_part_is_another(shown, tmp_path: Path) -> None:
+    runs, _ = shown
+    risk, always = (drive(runs[gate].trajectory, 0) for gate in ("risk", "always"))
+    for name, drives in (
+        ("apart", {"risk": risk, "always": always}),
+        ("same", {"risk": risk, "always": risk}),
+    ):
+        draw_drives(tmp_path / f"{name}.png", drives, 0.5, "title")
+    apart, same = (image.imread(tmp_path / f"{name}.png") for name in ("apart", "same"))
+    panels = slice(int(apart.shape[0] * 0.15), int(apart.shape[0] * 0.5))
+    assert (apart[panels] != same[panels]).any(axis=-1).mean() > 0.005

@@ -12,10 +12,11 @@ training = "torch", "mujoco", "gymnasium", "onnxscript", "scipy", "matplotlib", 
 for name in training:
     sys.modules[name] = None  # an import of it now raises ImportError
 import server, monitor, filter, models
+from server.app import create_app
 from server.serve import main
 loaded = monitor.Monitor.load(sys.argv[1], "always")
 assert loaded.decide([0.0] * 60).mode in ("nominal", "filtered")
-server.create_app(loaded)
+create_app(loaded)
 assert not {"trainer", "evaluation", "pointgoal.vector"} & set(sys.modules)
 """
 

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import json
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +15,8 @@ import pytest
 from fastapi.testclient import TestClient
 
 from monitor import Monitor
-from server import create_app
+from server.app import create_app
+from server.schema import ModelReply
 
 
 @pytest.fixture(scope="session")
@@ -40,3 +45,55 @@ def no_constant(name: str) -> Any:
 def strict_json():
     """Reads JSON that has no NaN and no Infinity."""
     return lambda text: json.loads(text, parse_constant=no_constant)
+
+
+Behaviour = Callable[[socket.socket, bytes], None]
+
+
+def http_reply(body: bytes, status: str = "200 OK") -> bytes:
+    return f"HTTP/1.1 {status}\r\ncontent-length: {len(body)}\r\n\r\n".encode() + body
+
+
+@contextmanager
+def fake_service(monitor: Monitor, act: Behaviour, model: bytes | None = None) -> Iterator[str]:
+    """A server that answers /model rightly and /act as told, each connection in a thread.
+
+    Args:
+        monitor: what /model tells.
+        act: is given the connection and the request's body.
+        model: the answer to /model, if another.
+    """
+    about = model if model is not None else http_reply(ModelReply.of(monitor).model_dump_json().encode())
+    listener = socket.create_server(("127.0.0.1", 0))
+
+    def handle(connection: socket.socket) -> None:
+        with connection, suppress(OSError):
+            while request := connection.recv(65536):
+                if request.startswith(b"GET /model"):
+                    connection.sendall(about)
+                else:
+                    act(connection, request.partition(b"\r\n\r\n")[2])
+
+    def serve() -> None:
+        with suppress(OSError):
+            while True:
+                connection, _ = listener.accept()
+                threading.Thread(target=handle, args=(connection,), daemon=True).start()
+
+    threading.Thread(target=serve, daemon=True).start()
+    try:
+        yield f"http://127.0.0.1:{listener.getsockname()[1]}"
+    finally:
+        listener.close()
+
+
+@pytest.fixture(scope="session")
+def fake():
+    """`fake_service`."""
+    return fake_service
+
+
+@pytest.fixture(scope="session")
+def http():
+    """The bytes of an HTTP reply."""
+    return http_reply

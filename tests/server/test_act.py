@@ -2,32 +2,94 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
+import time
 
 import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 
-from filter import FilterMemory
-from monitor import Decision
-from server import create_app
-from server.app import Lifecycle
+from decision import MEMORY, PLAN_STEPS, Decision, Faults, Mode, OpenedBy, Origin, memory_to_json
+from filter import Robot
+from monitor import Monitor
+from server.app import MANY_FAULTS, Lifecycle, create_app
+from server.schema import ActReply, decision_of, reply_of
+
+
+def same(value: object, other: object) -> bool:
+    """Bit for bit, NaN is NaN."""
+    return type(value) is type(other) and np.array_equal(value, other, equal_nan=isinstance(value, float))
+
+
+def assert_same(decision: Decision, other: Decision) -> None:
+    for field in dataclasses.fields(Decision):
+        one, two = getattr(decision, field.name), getattr(other, field.name)
+        if isinstance(one, np.ndarray | np.void):
+            assert one.tobytes() == two.tobytes(), field.name
+        else:
+            assert same(one, two), field.name
 
 
 def test_the_reply_is_the_monitors_decision(app, monitor, observation) -> None:
-    hazards = [[0.45, 0.0], [-1.0, 2.0]]
-    for given_hazards in (None, hazards):
-        body = {"observation": observation} | ({} if given_hazards is None else {"hazards": given_hazards})
+    memory = None
+    for given_hazards in (None, [[0.45, 0.0], [-1.0, 2.0]], [[0.3, 0.1]]):
+        body = {"observation": observation, "request": 7}
+        if given_hazards is not None:
+            body["hazards"] = given_hazards
+        if memory is not None:
+            body["memory"] = memory_to_json(memory)
         reply = app.post("/act", json=body).json()
-        decision = monitor.decide(observation, given_hazards)
-        assert reply["action"] == decision.action.tolist()
-        assert reply["nominal_action"] == decision.nominal_action.tolist()
-        for name in ("risk", "threshold", "mode", "barrier", "hazard", "row", "reason", "gate_open"):
-            assert reply[name] == getattr(decision, name)
-        assert reply["model"] == monitor.bundle.id
+        decision = monitor.decide(observation, given_hazards, memory)
+        assert_same(decision_of(ActReply.model_validate_json(json.dumps(reply))), decision)
+        assert reply["gate_open"] is True
+        assert (reply["request"], reply["gate"], reply["model"]) == (7, "always", monitor.bundle.id)
         assert 0.0 < reply["seconds"] < 60.0
+        memory = decision.memory
+
+
+def decisions() -> st.SearchStrategy[Decision]:
+    """Decisions of every shape, among them some that know nothing."""
+    action = arrays(np.float64, 2, elements=st.floats(-1.0, 1.0))
+    numbers = st.floats(-1e9, 1e9) | st.just(float("nan"))
+
+    def memory(side: int, guided: int, plan: list[np.ndarray]) -> np.void:
+        made = np.zeros(1, MEMORY)
+        made["side"], made["guided"], made["left"] = side, guided, len(plan)
+        made["plan"][0, : len(plan)] = np.reshape(plan, (-1, 2))
+        return made[0]
+
+    return st.builds(
+        Decision,
+        action=action,
+        nominal_action=action | st.just(np.full(2, np.nan)),
+        mode=st.sampled_from(Mode),
+        origin=st.none() | st.sampled_from(Origin),
+        certified=st.booleans(),
+        barrier=numbers,
+        hazard=st.none() | st.integers(0, 1000),
+        reason=st.none() | st.text(),
+        risk=numbers,
+        threshold=numbers,
+        opened_by=st.none() | st.sampled_from(OpenedBy),
+        memory=st.builds(
+            memory, st.integers(-127, 127), st.integers(0, 1), st.lists(action, max_size=PLAN_STEPS)
+        ),
+    )
+
+
+@given(decision=decisions())
+def test_a_decision_comes_back_from_the_wire_as_it_was(decision: Decision) -> None:
+    text = reply_of(decision, 3, "model", "risk", 0.001).model_dump_json()
+    json.loads(text, parse_constant=pytest.fail)
+    assert_same(decision_of(ActReply.model_validate_json(text)), decision)
+
+
+def test_every_field_of_a_decision_is_on_the_wire() -> None:
+    assert {field.name for field in dataclasses.fields(Decision)} <= set(ActReply.model_fields)
 
 
 NUMBERS = "[" + ", ".join(["0.5"] * 59) + ", {}]"
@@ -71,11 +133,22 @@ NUMBERS = "[" + ", ".join(["0.5"] * 59) + ", {}]"
             ["body", "hazards", 0, 1],
         ),
         (f'{{"observation": {NUMBERS.format(1)}, "hazards": 1}}'.encode(), ["body", "hazards"]),
-        (f'{{"observation": {NUMBERS.format(1)}, "memory": {{"x": [1]}}}}'.encode(), ["body", "memory"]),
-        (
-            f'{{"observation": {NUMBERS.format(1)}, "memory": {{"side": [NaN]}}}}'.encode(),
-            ["body", "memory", "side", 0],
+        *(
+            (f'{{"observation": {NUMBERS.format(1)}, "memory": {memory}}}'.encode(), ["body", *where])
+            for memory, where in (
+                ("3", ["memory"]),
+                ("{}", ["memory", "side"]),
+                ('{"side": 0, "guided": 0, "plan": [], "x": 1}', ["memory", "x"]),
+                ('{"side": 1.5, "guided": 0, "plan": []}', ["memory", "side"]),
+                ('{"side": true, "guided": 0, "plan": []}', ["memory", "side"]),
+                ('{"side": 0, "guided": null, "plan": []}', ["memory", "guided"]),
+                ('{"side": 0, "guided": 0, "plan": [[0]]}', ["memory", "plan", 0]),
+                ('{"side": 0, "guided": 0, "plan": [[NaN, 0]]}', ["memory", "plan", 0, 0]),
+                (f'{{"side": 0, "guided": 0, "plan": {[[0, 0]] * 21}}}', ["memory", "plan"]),
+            )
         ),
+        (f'{{"observation": {NUMBERS.format(1)}, "request": -1}}'.encode(), ["body", "request"]),
+        (f'{{"observation": {NUMBERS.format(1)}, "request": 1.5}}'.encode(), ["body", "request"]),
     ],
 )
 def test_what_cannot_be_decided_about_is_422_and_named(app, strict_json, body, where) -> None:
@@ -84,45 +157,94 @@ def test_what_cannot_be_decided_about_is_422_and_named(app, strict_json, body, w
     assert strict_json(reply.text)["detail"][0]["loc"] == where
 
 
+@pytest.mark.parametrize(
+    ("memory", "named"),
+    [
+        ({"side": 200, "guided": 0, "plan": []}, "memory.side"),
+        ({"side": 0, "guided": -1, "plan": []}, "memory.guided"),
+        ({"side": 0, "guided": 0, "plan": [[0.0, 1.5]]}, "memory.plan"),
+    ],
+)
+def test_a_memory_that_no_reply_held_is_422_and_named(app, observation, memory, named) -> None:
+    reply = app.post("/act", json={"observation": observation, "memory": memory})
+    assert reply.status_code == 422
+    (detail,) = reply.json()["detail"]
+    assert detail["loc"] == ["body", "memory"]
+    assert named in detail["msg"]
+
+
 def test_finite_nonsense_gets_the_fallback(app, strict_json, observation) -> None:
-    reply = app.post("/act", json={"observation": [1e300, *observation[1:]]})
-    assert reply.status_code == 200
-    content = strict_json(reply.text)
+    body = {"observation": [1e300, *observation[1:]]}
+    content = strict_json(app.post("/act", json=body).text)
     assert content["mode"] == "fallback"
-    assert content["reason"] == "observation[0] is 1e+300"
+    assert "observation[0]" in content["reason"]
     assert content["action"] == [0.0, 0.0]
+    # A robot that has a plan goes on with it.
+    body["memory"] = {"side": 0, "guided": 0, "plan": [[0.05, -1.0], [0.03, 0.0]]}
+    content = strict_json(app.post("/act", json=body).text)
+    assert (content["mode"], content["origin"]) == ("fallback", "plan")
+    assert content["action"] == [0.05, -1.0]
+    assert content["memory"]["plan"] == [[0.03, 0.0]]
+
+
+class Told(Monitor):
+    """A monitor that decides what a test says."""
+
+    def __init__(self, monitor: Monitor, **changes: object) -> None:
+        self.__dict__ |= monitor.__dict__ | {"faults": Faults()}
+        self.changes = changes
+
+    def decide(self, observation, hazards=None, memory=None) -> Decision:
+        return dataclasses.replace(super().decide(observation, hazards, memory), **self.changes)
 
 
 def test_numbers_that_are_none_leave_as_null(monitor, strict_json, observation) -> None:
-    class Unknowing:
-        bundle, gate, threshold = monitor.bundle, monitor.gate, monitor.threshold
-
-        def decide(self, observation, hazards, memory) -> Decision:
-            nothing = float("nan")
-            pair = np.array([nothing, np.inf])
-            return Decision(
-                np.zeros(2), pair, nothing, 0.5, "fallback", float("inf"), None, None, "broken", True, None
-            )
-
-    content = strict_json(
-        TestClient(create_app(Unknowing())).post("/act", json={"observation": observation}).text
+    unknown = Told(
+        monitor, nominal_action=np.array([np.nan, np.inf]), risk=float("nan"), barrier=float("inf")
     )
-    assert content["nominal_action"] is content["risk"] is content["barrier"] is content["memory"] is None
-    assert content["action"] == [0.0, 0.0]
+    reply = TestClient(create_app(unknown)).post("/act", json={"observation": observation})
+    content = strict_json(reply.text)
+    assert content["nominal_action"] is content["risk"] is content["barrier"] is None
+    assert np.isfinite(content["action"]).all()
 
 
-def test_a_decision_whose_action_is_no_number_never_leaves(monitor, observation) -> None:
-    class Broken:
-        bundle, gate, threshold = monitor.bundle, monitor.gate, monitor.threshold
+def test_an_action_that_is_no_number_never_leaves_and_the_service_degrades(
+    monitor, observation, caplog
+) -> None:
+    broken = Told(monitor, action=np.array([np.nan, 0.0]))
+    app = TestClient(create_app(broken))
+    for k in range(MANY_FAULTS):
+        assert app.get("/readyz").status_code == 200, k
+        assert app.post("/act", json={"observation": observation}).status_code == 500
+    reply = app.get("/readyz")
+    assert reply.status_code == 503
+    assert reply.json() == {"status": "degraded", "internal_faults": MANY_FAULTS}
+    assert app.get("/healthz").status_code == 200
+    assert len(caplog.records) == 1
 
-        def decide(self, observation, hazards, memory) -> Decision:
-            pair = np.array([np.nan, 0.0])
-            return Decision(pair, pair, 0.0, 0.5, "nominal", 0.0, None, None, None, True, None)
 
-    reply = TestClient(create_app(Broken()), raise_server_exceptions=False).post(
-        "/act", json={"observation": observation}
-    )
-    assert reply.status_code == 500
+def test_faults_inside_the_monitor_degrade_the_service_and_bad_input_does_not(
+    monitor, observation, monkeypatch
+) -> None:
+    told = Told(monitor)
+    app = TestClient(create_app(told))
+    for _ in range(3 * MANY_FAULTS):
+        content = app.post("/act", json={"observation": [1e300, *observation[1:]]}).json()
+        assert content["mode"] == "fallback"
+    assert app.get("/readyz").status_code == 200
+
+    def broken(*_: object) -> None:
+        raise AttributeError("a programming error")
+
+    monkeypatch.setattr(told, "_networks", broken)
+    for _ in range(MANY_FAULTS):
+        content = app.post("/act", json={"observation": observation}).json()
+        assert (content["mode"], content["action"]) == ("fallback", [0.0, 0.0])
+    assert app.get("/readyz").status_code == 503
+    # They are forgotten after a minute.
+    now = time.monotonic()
+    monkeypatch.setattr(time, "monotonic", lambda: now + 61.0)
+    assert app.get("/readyz").status_code == 200
 
 
 JSON = st.recursive(
@@ -152,7 +274,7 @@ def test_whatever_comes_is_decided_or_refused_in_strict_json(
 
 def test_the_memory_of_a_reply_is_taken_back(app, observation) -> None:
     memory = app.post("/act", json={"observation": observation}).json()["memory"]
-    assert set(memory) == set(FilterMemory.__dataclass_fields__)
+    assert set(memory) == {"side", "guided", "plan"}
     assert app.post("/act", json={"observation": observation, "memory": memory}).status_code == 200
 
 
@@ -163,6 +285,11 @@ def test_a_body_above_the_limit_is_413(monitor, stated) -> None:
     reply = app.post("/act", content=content)
     assert reply.status_code == 413
     assert "1000 bytes" in reply.json()["detail"][0]["msg"]
+
+
+def test_a_stated_length_of_any_size_is_413(app) -> None:
+    for digits in (10, 5000):
+        assert app.post("/act", content=b"{}", headers={"content-length": "9" * digits}).status_code == 413
 
 
 def test_the_key_is_asked_for_everywhere_but_at_the_health_checks(monitor, observation) -> None:
@@ -199,10 +326,15 @@ def test_the_model_is_told(app, monitor) -> None:
     assert [block["name"] for block in content["observation_layout"]][:2] == ["accelerometer", "velocimeter"]
     assert (content["gate"], content["threshold"]) == ("always", manifest.threshold)
     assert content["threshold_source"] == manifest.threshold_source
+    assert content["floor"] == monitor.gate.floor
+    assert content["guide"] == "refusal"
+    assert content["robot"] == Robot()._asdict()
+    assert (content["action_low"], content["action_high"]) == ([-1.0, -1.0], [1.0, 1.0])
 
 
 def test_the_schema_tells_the_length_of_an_observation(app) -> None:
     operation = app.get("/openapi.json").json()["paths"]["/act"]["post"]
     schema = operation["requestBody"]["content"]["application/json"]["schema"]
     assert schema["properties"]["observation"]["minItems"] == 60
-    assert "action" in json.dumps(app.get("/openapi.json").json()["components"]["schemas"]["ActReply"])
+    reply = app.get("/openapi.json").json()["components"]["schemas"]["ActReply"]
+    assert {"action", "origin", "opened_by", "memory", "request"} <= set(reply["required"])

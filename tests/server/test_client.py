@@ -3,191 +3,472 @@
 from __future__ import annotations
 
 import json
+import logging
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
+from decision import MEMORY, PLAN_STEPS, Decision
 from evaluation.service import Service
 from pointgoal.observation import layout
-from server import Client, ClientError, ModelReply
+from server import Client, ClientError
+from server.link import MAX_REPLY
+from server.schema import reply_of
 
-Behaviour = Callable[[socket.socket], None]
+Act = Callable[[socket.socket, bytes], None]
 
 
 def http(body: bytes, status: str = "200 OK") -> bytes:
     return f"HTTP/1.1 {status}\r\ncontent-length: {len(body)}\r\n\r\n".encode() + body
 
 
-@contextmanager
-def fake_service(monitor, act: Behaviour, model: bytes | None = None) -> Iterator[str]:
-    """A server that answers /model rightly and /act as told, one connection after the other."""
-    about = model if model is not None else http(ModelReply.of(monitor).model_dump_json().encode())
-    listener = socket.create_server(("127.0.0.1", 0))
-
-    def serve() -> None:
-        with suppress(OSError):
-            while True:
-                connection, _ = listener.accept()
-                with connection, suppress(OSError):
-                    while request := connection.recv(65536):
-                        if request.startswith(b"GET /model"):
-                            connection.sendall(about)
-                        else:
-                            act(connection)
-
-    thread = threading.Thread(target=serve, daemon=True)
-    thread.start()
-    yield f"http://127.0.0.1:{listener.getsockname()[1]}"
-    listener.close()
-
-
-def silence(connection: socket.socket) -> None:
+def silence(connection: socket.socket, asked: bytes) -> None:
     time.sleep(0.6)
 
 
-def trickle(connection: socket.socket) -> None:
+def trickle(connection: socket.socket, asked: bytes) -> None:
     for byte in http(b"{" + b" " * 100):
         connection.sendall(bytes([byte]))
         time.sleep(0.05)
 
 
-def trickling_headers(connection: socket.socket) -> None:
+def trickling_headers(connection: socket.socket, asked: bytes) -> None:
     connection.sendall(b"HTTP/1.1 200 OK\r\n")
     for k in range(60):
         connection.sendall(f"x-{k}: 1\r\n".encode())
         time.sleep(0.05)
 
 
-def hang_up(connection: socket.socket) -> None:
+def endless(head: bytes, part: bytes) -> Act:
+    def behaviour(connection: socket.socket, asked: bytes) -> None:
+        connection.sendall(head)
+        while True:
+            connection.sendall(part)
+
+    return behaviour
+
+
+def hang_up(connection: socket.socket, asked: bytes) -> None:
     connection.shutdown(socket.SHUT_RDWR)
 
 
-def cut_short(connection: socket.socket) -> None:
-    connection.sendall(b'HTTP/1.1 200 OK\r\ncontent-length: 500\r\n\r\n{"action": [1')
-    connection.shutdown(socket.SHUT_RDWR)
+def says(reply: bytes, hangs_up: bool = False) -> Act:
+    def behaviour(connection: socket.socket, asked: bytes) -> None:
+        connection.sendall(reply)
+        if hangs_up:
+            connection.shutdown(socket.SHUT_RDWR)
+
+    return behaviour
 
 
-def says(reply: bytes) -> Behaviour:
-    return lambda connection: connection.sendall(reply)
+ACTION = [0.02, 0.5]
+PLAN = [[-0.05, 0.25], [0.05, -1.0], [-0.03, 0.0]]
 
 
-GOOD = {
-    "action": [0.5, 0.5],
-    "nominal_action": [0.5, 0.5],
-    "risk": 0.1,
-    "threshold": 0.5,
-    "mode": "nominal",
-    "barrier": 1.0,
-    "hazard": None,
-    "row": None,
-    "reason": None,
-    "gate_open": False,
-    "model": "x",
-    "seconds": 0.001,
-    "memory": None,
-}
+def good(asked: bytes) -> dict[str, object]:
+    """What a service answers that is in order; the model and the threshold are those of the tiny bundle."""
+    return {
+        "action": ACTION,
+        "nominal_action": ACTION,
+        "mode": "nominal",
+        "origin": None,
+        "certified": True,
+        "barrier": 1.0,
+        "hazard": None,
+        "reason": None,
+        "risk": 0.1,
+        "threshold": 0.5,
+        "opened_by": "always",
+        "memory": {"side": 3, "guided": 1, "plan": PLAN},
+        "gate_open": True,
+        "gate": "always",
+        "model": MODEL[0],
+        "request": json.loads(asked)["request"],
+        "seconds": 0.001,
+    }
 
 
-def replies(**changes: object) -> Behaviour:
-    return says(http(json.dumps(GOOD | changes).encode()))
+MODEL = [""]
+FIELDS = sorted(good(b'{"request": 0}'))
+
+
+@pytest.fixture(autouse=True)
+def _model(monitor) -> None:
+    MODEL[0] = monitor.bundle.id
+
+
+def replies(**changes: object) -> Act:
+    """Answers well but for some fields."""
+    return lambda connection, asked: connection.sendall(http(json.dumps(good(asked) | changes).encode()))
+
+
+def in_turn(*behaviours: Act) -> Act:
+    left = list(behaviours)
+
+    def behaviour(connection: socket.socket, asked: bytes) -> None:
+        left.pop(0)(connection, asked)
+
+    return behaviour
+
+
+def planned(actions: list[list[float]] = PLAN) -> np.void:
+    """A robot's memory that holds a plan."""
+    memory = np.zeros(1, MEMORY)
+    memory["side"], memory["left"] = -4, len(actions)
+    memory["plan"][0, : len(actions)] = actions
+    return memory[0]
+
+
+def assert_fallback(decision: Decision, reason: str, action: object = (0.0, 0.0), left: int = 0) -> None:
+    assert (decision.mode, decision.origin, decision.opened_by) == ("fallback", "plan", "fault")
+    assert reason in str(decision.reason)
+    assert decision.action.tolist() == list(action)
+    assert not decision.certified
+    assert np.isnan([decision.risk, decision.barrier, *decision.nominal_action]).all()
+    assert decision.threshold == 0.5
+    assert len(decision.plan) == left
+
+
+HUGE = b"HTTP/1.1 200 OK\r\ncontent-length: %b\r\n\r\n"
+CHUNKED = b"HTTP/1.1 200 OK\r\ntransfer-encoding: chunked\r\n\r\n"
+MISBEHAVIOUR = [
+    (silence, "no reply within 0.3 s"),
+    (trickle, "no reply within 0.3 s"),
+    (trickling_headers, "no reply within 0.3 s"),
+    (hang_up, "connection"),
+    (says(b'HTTP/1.1 200 OK\r\ncontent-length: 500\r\n\r\n{"action": [1', True), "connection"),
+    (says(b"SSH-2.0-OpenSSH_9.2\r\n"), "connection"),
+    (says(http(b"", "503 Service Unavailable")), "answered 503"),
+    (says(http(b'{"detail": "x"}', "422 Unprocessable")), "answered 422"),
+    (says(http(b"", "302 Found")), "answered 302"),
+    (says(http(b"not json")), "the reply is not one"),
+    (says(http(b"{}")), "the reply is not one"),
+    (says(http(b"[" * 100_000)), "the reply is not one"),
+    (says(http(b"9" * 100_000)), "the reply is not one"),
+    (says(HUGE % b"100000000000000000000"), "no length"),
+    (says(HUGE % (b"9" * 5000)), "no length"),
+    (says(HUGE % b"-1"), "no length"),
+    (says(HUGE % b"nonsense"), "no length"),
+    (says(HUGE % str(MAX_REPLY + 1).encode()), "no length"),
+    (says(b"HTTP/1.1 200 OK\r\n\r\n{}", True), "no length"),
+    (says(CHUNKED + b"FFFFFFFFFFFFFFFFFFFFFFFF\r\n{}"), "no length"),
+    (says(CHUNKED + b"-1\r\n{}"), "no length"),
+    (says(CHUNKED + b"nonsense\r\n"), "no length"),
+    (endless(b"HTTP/1.1 200 OK\r\n", b"x: 1\r\n" * 1000), "connection"),
+    (endless(b"HTTP/1.1 200 OK\r\n", b"x" * 5000), "connection"),
+    (endless(b"", b"HTTP/1.1 100 Continue\r\n\r\n" * 100), "more than"),
+    (endless(b"HTTP/1.1 200 OK\r\ncontent-length: 200000\r\nx: ", b"x" * 60_000), "connection"),
+]
+
+
+@pytest.mark.parametrize(("behaviour", "reason"), MISBEHAVIOUR)
+def test_a_service_that_misbehaves_leaves_the_robot_with_its_plan_in_time(
+    fake, monitor, observation, behaviour, reason
+) -> None:
+    with fake(monitor, behaviour) as url, Client(url, timeout=0.3) as client:
+        started = time.monotonic()
+        decision = client.decide(observation, memory=planned())
+        assert time.monotonic() - started < 2.0
+        assert_fallback(decision, reason, PLAN[0], left=2)
+        assert decision.memory["side"] == -4
+        assert sum(client.faults.counts.values()) == 1
+        assert client.faults.internal() == 0
 
 
 @pytest.mark.parametrize(
-    ("behaviour", "reason"),
+    ("changes", "reason"),
     [
-        (silence, "no reply within 0.3 s"),
-        (trickle, "no reply within 0.3 s"),
-        (trickling_headers, "no reply within 0.3 s"),
-        (hang_up, "connection"),
-        (cut_short, "connection"),
-        (says(b"SSH-2.0-OpenSSH_9.2\r\n"), "connection"),
-        (says(http(b"", "503 Service Unavailable")), "answered 503"),
-        (says(http(b'{"detail": "x"}', "422 Unprocessable")), "answered 422"),
-        (says(http(b"", "302 Found")), "answered 302"),
-        (says(http(b"not json")), "the reply is not one"),
-        (says(http(b"{}")), "the reply is not one"),
-        (replies(action=[float("nan"), 0.0]), "the reply is not one"),
-        (replies(action=["1", "2"]), "the reply is not one"),
-        (replies(action=[1.0]), "the reply is not one"),
-        (replies(mode="reckless"), "the reply is not one"),
+        ({"action": [float("nan"), 0.0]}, "not one"),
+        ({"action": None}, "not one"),
+        ({"action": ["1", "2"]}, "not one"),
+        ({"action": [1.0]}, "not one"),
+        ({"action": [1.0, 0.0, 0.0]}, "not one"),
+        ({"action": [1.0 + 1e-9, 0.0], "mode": "filtered"}, "an action out of bounds"),
+        ({"action": [0.0, -1e300], "mode": "filtered"}, "an action out of bounds"),
+        ({"mode": "reckless"}, "not one"),
+        ({"mode": None}, "not one"),
+        ({"origin": "hope"}, "not one"),
+        ({"opened_by": "chance"}, "not one"),
+        ({"certified": 1}, "not one"),
+        ({"nominal_action": [0.02, 0.4]}, "nominal"),
+        ({"nominal_action": None}, "nominal"),
+        ({"memory": None}, "not one"),
+        ({"memory": {"side": 0, "guided": 0, "plan": [[0.0, 0.0]] * (PLAN_STEPS + 1)}}, "not one"),
+        ({"memory": {"side": 0, "guided": 0, "plan": [[0.0, 2.0]]}}, "memory.plan"),
+        ({"memory": {"side": 10**30, "guided": 0, "plan": []}}, "memory.side"),
+        ({"model": "other@000000000000"}, "of model other@000000000000"),
+        ({"gate": "off"}, "of gate off"),
+        ({"threshold": 0.6}, "of threshold 0.6"),
+        ({"threshold": None}, "of threshold nan"),
+        ({"request": 99}, "of request 99"),
+        ({"request": "1"}, "not one"),
     ],
 )
-def test_a_service_that_misbehaves_gets_zero_thrust_in_time(monitor, observation, behaviour, reason) -> None:
-    with fake_service(monitor, behaviour) as url, Client(url, timeout=0.3) as client:
-        started = time.monotonic()
-        reply = client.act(observation)
-        assert time.monotonic() - started < 2.0
-        assert (reply.mode, reply.action) == ("fallback", [0.0, 0.0])
-        assert reason in str(reply.reason)
-        assert reply.model is None
+def test_a_reply_that_is_not_to_be_trusted_is_not_followed(
+    fake, monitor, observation, changes, reason
+) -> None:
+    behaviour = in_turn(replies(**changes), replies())
+    with fake(monitor, behaviour) as url, Client(url, timeout=5.0) as client:
+        assert_fallback(client.decide(observation, memory=planned()), reason, PLAN[0], left=2)
+        assert client.decide(observation).action.tolist() == ACTION
 
 
-def test_a_fault_forgets_the_filters_memory(monitor, observation) -> None:
-    seen: list[bool] = []
-    answers = iter([replies(memory={"side": [1]}), replies(action=["1", "2"]), replies()])
+def test_a_good_reply_is_the_decision(fake, monitor, observation) -> None:
+    asked = []
 
-    def in_turn(connection: socket.socket) -> None:
-        next(answers)(connection)
+    def behaviour(connection: socket.socket, body: bytes) -> None:
+        asked.append(json.loads(body))
+        replies()(connection, body)
 
-    with fake_service(monitor, in_turn) as url, Client(url) as client:
-        exchange = client._link.exchange
+    with fake(monitor, behaviour) as url, Client(url, timeout=5.0) as client:
+        decision = client.decide(observation, [[1.0, 2.0]])
+        assert (decision.mode, decision.reason, decision.risk) == ("nominal", None, 0.1)
+        assert decision.plan.tolist() == PLAN
+        client.decide(np.array(observation), memory=decision.memory)
+    assert "memory" not in asked[0]
+    assert asked[0]["hazards"] == [[1.0, 2.0]]
+    assert asked[1]["memory"] == {"side": 3, "guided": 1, "plan": PLAN}
+    assert asked[0]["observation"] == asked[1]["observation"] == observation
+    assert asked[0]["request"] != asked[1]["request"]
 
-        def watched(method: str, path: str, body: bytes, timeout: float) -> tuple[int, bytes]:
-            seen.append(b"memory" in body)
-            return exchange(method, path, body, timeout)
 
-        client._link.exchange = watched
-        modes = [client.act(observation).mode for _ in range(3)]
-    assert modes == ["nominal", "fallback", "nominal"]
-    assert seen == [False, True, False]
+def twice_at_once(connection: socket.socket, asked: bytes) -> None:
+    connection.sendall(http(json.dumps(good(asked)).encode()) * 2)
 
 
-def test_it_goes_on_after_a_fault(monitor, observation) -> None:
-    answers = iter([silence, replies(), hang_up, replies(action=[0.25, 0.0])])
+def twice(connection: socket.socket, asked: bytes) -> None:
+    replies()(connection, asked)
+    time.sleep(0.2)
+    replies()(connection, asked)
 
-    def in_turn(connection: socket.socket) -> None:
-        next(answers)(connection)
 
+def test_a_reply_that_comes_twice_answers_one_request(fake, monitor, observation) -> None:
+    last = replies(action=[0.0, 0.25], mode="filtered", origin="barrier")
+    with fake(monitor, in_turn(twice, replies(), last)) as url, Client(url, timeout=5.0) as client:
+        assert client.decide(observation).reason is None
+        time.sleep(0.4)
+        assert_fallback(client.decide(observation, memory=planned()), "of request 1, not 2", PLAN[0], left=2)
+        assert client.decide(observation).action.tolist() == [0.0, 0.25]
+    with fake(monitor, in_turn(twice_at_once, last)) as url, Client(url, timeout=5.0) as client:
+        assert client.decide(observation).reason is None
+        assert client.decide(observation).action.tolist() == [0.0, 0.25]
+
+
+@settings(max_examples=300, deadline=None)
+@given(
+    content=st.binary(max_size=100)
+    | st.recursive(
+        st.none() | st.booleans() | st.floats() | st.integers() | st.text(max_size=5),
+        lambda inner: (
+            st.lists(inner, max_size=4) | st.dictionaries(st.sampled_from(FIELDS), inner, max_size=17)
+        ),
+    ).map(lambda value: json.dumps(value).encode())
+)
+def test_nothing_that_is_sent_makes_it_raise(tiny_client, content) -> None:
+    client, observation = tiny_client
+    client._link.exchange = lambda *_: (200, content)
+    assert client.decide(observation, memory=planned()).action.tolist() == PLAN[0]
+
+
+def test_a_field_of_any_kind_does_not_make_it_raise(tiny_client) -> None:
+    client, observation = tiny_client
+    values = [None, True, -1, 10**400, 1e300, float("nan"), float("inf"), "", "x" * 5000, [], {}, [[]], [{}]]
+    for name in FIELDS:
+        for value in values:
+            client._request = 0
+            body = json.dumps(good(b'{"request": 1}') | {name: value}).encode()
+            client._link.exchange = lambda *_, body=body: (200, body)
+            assert np.isfinite(client.decide(observation, memory=planned()).action).all()
+
+
+@pytest.fixture(scope="module")
+def tiny_client(fake, monitor):
+    """A client whose connection a test replaces, and an observation."""
+    with fake(monitor, silence) as url, Client(url, timeout=5.0) as client:
+        yield client, [0.25] * 60
+
+
+@pytest.mark.parametrize(
+    "error", [MemoryError(), RecursionError("deep"), OverflowError("large"), KeyError("x"), UnicodeError("x")]
+)
+def test_whatever_is_raised_inside_is_caught_counted_and_logged_once(
+    fake, monitor, observation, caplog, error
+) -> None:
+    with fake(monitor, silence) as url, Client(url) as client:
+
+        def broken(*_: object) -> None:
+            raise error
+
+        client._link.exchange = broken
+        with caplog.at_level(logging.WARNING, "lagnet.client"):
+            for _ in range(7):
+                assert client.decide(observation, memory=planned()).action.tolist() == PLAN[0]
+        assert len(caplog.records) == 1
+        assert sum(client.faults.counts.values()) == 7
+
+
+def test_ctrl_c_goes_through(fake, monitor, observation) -> None:
+    with fake(monitor, silence) as url, Client(url) as client:
+
+        def interrupted(*_: object) -> None:
+            raise KeyboardInterrupt
+
+        client._link.exchange = interrupted
+        with pytest.raises(KeyboardInterrupt):
+            client.decide(observation)
+
+
+def test_the_plan_is_played_to_its_end_and_then_the_robot_coasts(fake, monitor, observation) -> None:
+    behaviour = in_turn(replies(), *[hang_up] * 20)
+    with fake(monitor, behaviour) as url, Client(url, timeout=5.0) as client:
+        decision = client.decide(observation)
+        played = []
+        for left in (2, 1, 0, 0, 0):
+            decision = client.decide(observation, memory=decision.memory)
+            assert len(decision.plan) == left
+            played.append(decision.action.tolist())
+        assert played == [*PLAN, [0.0, 0.0], [0.0, 0.0]]
+
+
+def test_it_goes_on_after_a_fault(fake, monitor, observation) -> None:
+    other = replies(action=[0.25, 0.0], mode="filtered", origin="barrier")
     with (
-        fake_service(monitor, in_turn) as url,
+        fake(monitor, in_turn(silence, replies(), hang_up, other)) as url,
         Client(url, timeout=0.3) as client,
     ):
-        assert client.act(observation).mode == "fallback"
-        time.sleep(0.5)
-        assert client.act(observation).action == [0.5, 0.5]
+        assert client.decide(observation).mode == "fallback"
+        assert client.decide(observation).action.tolist() == ACTION
         # The third answer hangs up on a kept connection: asked once more on a fresh one.
-        assert client.act(observation).action == [0.25, 0.0]
+        assert client.decide(observation).action.tolist() == [0.25, 0.0]
 
 
-@pytest.mark.parametrize("bad", [[float("nan")] * 60, [float("inf")] * 60, ["x"] * 60, [10**400], None])
-def test_what_cannot_be_sent_gets_zero_thrust(monitor, bad) -> None:
-    with fake_service(monitor, replies()) as url, Client(url) as client:
-        reply = client.act(bad)
-        assert reply.mode == "fallback"
-        assert "cannot be sent" in str(reply.reason)
+@pytest.mark.parametrize(
+    "bad",
+    [
+        [float("nan")] * 60,
+        [float("inf")] * 60,
+        ["x"] * 60,
+        [10**400],
+        None,
+        [0.0] * 59,
+        [[0.0] * 60],
+        object(),
+    ],
+)
+def test_what_cannot_be_sent_leaves_the_robot_with_its_plan(fake, monitor, bad) -> None:
+    with fake(monitor, replies()) as url, Client(url, timeout=5.0) as client:
+        assert_fallback(client.decide(bad, memory=planned()), "bad input", PLAN[0], left=2)
+        # The connection is as good as before.
+        assert client.decide([0.0] * 60).action.tolist() == ACTION
+
+
+@pytest.mark.parametrize("bad", [[[float("nan"), 0.0]], "x", 10**400])
+def test_hazards_that_cannot_be_sent(fake, monitor, observation, bad) -> None:
+    with fake(monitor, replies()) as url, Client(url, timeout=5.0) as client:
+        assert_fallback(client.decide(observation, bad, planned()), "bad input", PLAN[0], left=2)
+
+
+@pytest.mark.parametrize(
+    "memory",
+    [
+        np.zeros(2, MEMORY),
+        np.zeros(0, MEMORY),
+        np.zeros(1),
+        {"side": 0, "guided": 0, "plan": PLAN},
+        planned([[float("nan"), 0.0]]),
+        planned([[0.0, 1.5]]),
+    ],
+    ids=["two", "none", "numbers", "json", "nan", "out of bounds"],
+)
+def test_a_memory_that_is_none_is_not_played(fake, monitor, observation, memory) -> None:
+    with fake(monitor, replies()) as url, Client(url, timeout=5.0) as client:
+        assert_fallback(client.decide(observation, memory=memory), "bad input")
+
+
+def test_every_address_of_a_host_is_tried(fake, monitor, observation, monkeypatch) -> None:
+    with fake(monitor, replies()) as url:
+        port = int(url.rsplit(":", 1)[1])
+        asked = []
+        dead = socket.create_server(("127.0.0.1", 0))
+        dead_port = dead.getsockname()[1]
+        dead.close()
+
+        def two(host: str, port: int, **_: object) -> list[tuple[object, ...]]:
+            asked.append(host)
+            kind = (socket.AF_INET, socket.SOCK_STREAM, 6, "")
+            return [(*kind, ("127.0.0.1", dead_port)), (*kind, ("127.0.0.1", port))]
+
+        monkeypatch.setattr(socket, "getaddrinfo", two)
+        with Client(f"http://localhost:{port}", timeout=5.0) as client:
+            client._link.close()
+            assert client.decide(observation).reason is None
+        # A look-up may take seconds: never again while the robot moves.
+        assert asked == ["localhost"]
 
 
 def test_the_real_service_and_after_its_end(tiny_bundle: Path, monitor, observation) -> None:
     with Service.start(tiny_bundle, "always") as service:
         client = Client(service.url, layout(1).to_json(), timeout=5.0)
-        reply = client.act(observation, [[0.45, 0.0]])
-        assert reply.action == monitor.decide(observation, [[0.45, 0.0]]).action.tolist()
         assert client.model().model == monitor.bundle.id
-        # A wrong length is the service's 422, and the robot's zero thrust.
-        assert "must have 60 numbers" in str(client.act(observation[:-1]).reason)
-    reply = client.act(observation)
-    assert (reply.mode, reply.action) == ("fallback", [0.0, 0.0])
-    assert "connection" in str(reply.reason)
+        memory = past = None
+        for hazards in ([[0.45, 0.0]], None, [[0.3, 0.1], [1.0, 1.0]]):
+            told, decided = (
+                client.decide(observation, hazards, memory),
+                monitor.decide(observation, hazards, past),
+            )
+            memory, past = told.memory, decided.memory
+            assert memory.tobytes() == past.tobytes()
+            assert told.action.tobytes() == decided.action.tobytes()
+            for name in (
+                "mode",
+                "origin",
+                "certified",
+                "barrier",
+                "hazard",
+                "risk",
+                "threshold",
+                "opened_by",
+            ):
+                assert getattr(told, name) == getattr(decided, name)
+        assert "bad input" in str(client.decide(observation[:-1]).reason)
+    assert_fallback(client.decide(observation, memory=planned()), "connection", PLAN[0], left=2)
     client.close()
 
 
-def test_another_observation_layout_is_refused_before_the_robot_moves(monitor) -> None:
-    with fake_service(monitor, replies()) as url:
+def test_clients_of_one_service_do_not_mix(fake, monitor, observation) -> None:
+    """Each gets the answer to its own request, also in threads."""
+
+    def behaviour(connection: socket.socket, asked: bytes) -> None:
+        turn = json.loads(asked)["observation"][0]
+        replies(action=[0.0, turn], mode="filtered", origin="barrier")(connection, asked)
+
+    with fake(monitor, behaviour) as url:
+        wrong = []
+
+        def drive(turn: float) -> None:
+            with Client(url, timeout=5.0) as client:
+                for _ in range(50):
+                    decision = client.decide([turn, *observation[1:]])
+                    if decision.action.tolist() != [0.0, turn]:
+                        wrong.append(decision)
+
+        threads = [threading.Thread(target=drive, args=(k / 10,)) for k in range(4)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert wrong == []
+
+
+def test_another_observation_layout_is_refused_before_the_robot_moves(fake, monitor) -> None:
+    with fake(monitor, replies()) as url:
         Client(url, layout(1).to_json()).close()
         with pytest.raises(ClientError, match="another observation layout"):
             Client(url, layout(0).to_json())
@@ -211,10 +492,19 @@ def test_a_service_that_is_not_there_is_an_error_at_connect(url: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "model", [http(b"{}"), http(b"hello"), http(b"", "404 Not Found"), b"nonsense\r\n\r\n"]
+    "model",
+    [
+        http(b"{}"),
+        http(b"hello"),
+        http(b"", "404 Not Found"),
+        b"nonsense\r\n\r\n",
+        HUGE % b"100000000000000000000",
+        CHUNKED + b"FFFFFFFFFFFFFFFFFFFF\r\n",
+        http(b"[" * 100_000),
+    ],
 )
-def test_what_is_no_lagnet_service_is_an_error_at_connect(monitor, model: bytes) -> None:
-    with fake_service(monitor, replies(), model) as url, pytest.raises(ClientError):
+def test_what_is_no_lagnet_service_is_an_error_at_connect(fake, monitor, model: bytes) -> None:
+    with fake(monitor, replies(), model) as url, pytest.raises(ClientError):
         Client(url)
 
 
@@ -228,3 +518,8 @@ def test_a_timeout_that_is_none_is_refused(timeout: float) -> None:
 def test_a_key_that_no_header_can_carry_is_refused(key: str) -> None:
     with pytest.raises(ValueError, match="API key"):
         Client("http://127.0.0.1:1", api_key=key)
+
+
+def test_the_fakes_good_reply_is_one_that_the_service_could_send(monitor, observation) -> None:
+    real = reply_of(monitor.decide(observation), 1, monitor.bundle.id, "always", 0.001)
+    assert set(json.loads(real.model_dump_json())) == set(FIELDS)

@@ -84,13 +84,14 @@ def test_the_key_comes_from_the_file_or_the_environment(tmp_path: Path, monkeypa
 
 
 def test_a_stop_says_not_ready_first_and_finishes_what_is_in_flight(tiny_bundle: Path, observation) -> None:
-    command = [*COMMAND, str(tiny_bundle), "--port", "0", "--gate", "risk", "--drain-seconds", "1.0"]
+    command = [*COMMAND, str(tiny_bundle), "--port", "0", "--gate", "risk", "--guide", "off"]
+    command += ["--drain-seconds", "1.0"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:
         assert select.select([process.stdout], [], [], 60.0)[0]
         said = json.loads(process.stdout.readline())
         assert said["event"] == "listening"
-        assert said["gate"] == "risk"
+        assert (said["gate"], said["guide"]) == ("risk", "off")
         assert said["url"] == f"http://127.0.0.1:{said['port']}"
         link = http.client.HTTPConnection("127.0.0.1", said["port"])
         # A request of which only the head has arrived when the stop is asked for.
@@ -108,7 +109,8 @@ def test_a_stop_says_not_ready_first_and_finishes_what_is_in_flight(tiny_bundle:
         reply = link.getresponse()
         assert (reply.status, reply.read()) == (503, b'{"status":"draining"}')
         with Client(said["url"], timeout=5.0) as client:
-            assert client.act(observation).model == said["model"]
+            assert client.model().model == said["model"]
+            assert client.decide(observation).reason is None
         threading.Timer(1.2, slow.sendall, (body,)).start()
         assert b"200 OK" in slow.recv(65536)
         assert process.wait(10.0) == 0

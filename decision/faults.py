@@ -7,21 +7,23 @@ import time
 from collections import Counter, deque
 from threading import Lock
 
-logger = logging.getLogger("lagnet.monitor")
-
 _QUIET = 60.0
 """How long a kind of fault is not logged again, and how long an internal one is remembered [s]."""
 
 
 class Faults:
-    """The faults of one monitor.
+    """The faults of one monitor, or of one client.
+
+    Args:
+        logger: the name of the logger that they go to.
 
     Attributes:
         counts: kind → how many there were.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, logger: str = "lagnet.monitor") -> None:
         self.counts: Counter[str] = Counter()
+        self._logger = logging.getLogger(logger)
         self._logged: dict[str, float] = {}
         self._internal: deque[float] = deque(maxlen=1000)
         self._lock = Lock()
@@ -43,7 +45,7 @@ class Faults:
             if due:
                 self._logged[kind] = now
         if due:
-            logger.warning("%s (%d so far): %s", kind, self.counts[kind], message, exc_info=error)
+            self._logger.warning("%s (%d so far): %s", kind, self.counts[kind], message, exc_info=error)
 
     def internal(self) -> int:
         """How many internal faults the last minute had, a thousand at most."""
