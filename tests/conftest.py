@@ -1,4 +1,4 @@
-"""What the tests of several rooms need: scenes made by hand, a closed loop, a tiny bundle with random weights."""
+"""What the tests of several rooms need: scenes made by hand, a closed loop, a tiny random bundle."""
 
 from __future__ import annotations
 

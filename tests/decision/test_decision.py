@@ -5,12 +5,13 @@ from __future__ import annotations
 import subprocess
 import sys
 from dataclasses import fields
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from decision import MEMORY, PLAN_STEPS, Decision, Decisions, Mode, OpenedBy, Origin
+from decision import MEMORY, PLAN_STEPS, Decision, Decisions, Mode, OpenedBy, Origin, texts, unknown
 
 N = 7
 
@@ -79,15 +80,30 @@ def test_rows_make_the_batch_again(batch) -> None:
 
 @pytest.mark.parametrize("cuts", [(0, N), (0, 3, N), (0, 1, 2, N)])
 def test_parts_make_the_batch_again(batch, cuts) -> None:
-    parts = [
-        Decisions.of([batch[k] for k in range(start, stop)])
-        for start, stop in zip(cuts[:-1], cuts[1:], strict=True)
-    ]
+    parts = [Decisions.of([batch[k] for k in range(start, stop)]) for start, stop in pairwise(cuts)]
     again = Decisions.join(parts)
     for field in fields(Decisions):
         a, b = getattr(batch, field.name), getattr(again, field.name)
         # Texts are as wide as the widest of their part.
         assert a.tolist() == b.tolist() if field.name in ("mode", "origin", "opened_by") else same(a, b)
+
+
+def test_texts_are_wide_enough_for_every_name_and_not_to_be_written_to() -> None:
+    for name in (*Mode, *Origin, *OpenedBy):
+        assert texts(name, 3).tolist() == [name] * 3
+    with pytest.raises(ValueError, match="read-only"):
+        texts("", 3)[0] = "x"
+    with pytest.raises(ValueError, match="read-only"):
+        unknown(3)[0] = 1.0
+
+
+def test_what_is_told_of_policy_and_gate_changes_nothing_else(batch) -> None:
+    told = batch.told(np.zeros((N, 2)), np.ones(N), 0.25, texts(OpenedBy.RISK, N))
+    assert told.threshold == 0.25
+    changed = {"nominal_action", "risk", "threshold", "opened_by"}
+    for field in fields(Decisions):
+        same_one = getattr(told, field.name) is getattr(batch, field.name)
+        assert same_one != (field.name in changed), field.name
 
 
 def test_the_names_are_texts_for_users() -> None:

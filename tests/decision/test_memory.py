@@ -19,7 +19,7 @@ def memories(draw: st.DrawFn) -> np.ndarray:
     """Memories (1,) that a filter can leave."""
     memory = np.zeros(1, MEMORY)
     plan = draw(st.lists(st.tuples(controls, controls), max_size=PLAN_STEPS))
-    memory["side"], memory["guided"] = draw(st.integers(-127, 127)), draw(st.integers(0, 1))
+    memory["side"], memory["guided"] = draw(st.integers(-127, 127)), draw(st.integers(-1, 1))
     memory["left"] = len(plan)
     memory["plan"][0, : len(plan)] = np.array(plan).reshape(-1, 2)
     return memory
@@ -53,7 +53,8 @@ def good() -> dict:
         (lambda m: m.update(side=True), r"memory\.side"),
         (lambda m: m.update(side="left"), r"memory\.side"),
         (lambda m: m.update(side=None), r"memory\.side"),
-        (lambda m: m.update(guided=-1), r"memory\.guided"),
+        (lambda m: m.update(guided=-2), r"memory\.guided"),
+        (lambda m: m.update(guided=2), r"memory\.guided"),
         (lambda m: m.update(guided=None), r"memory\.guided"),
         (lambda m: m.update(plan=None), r"memory\.plan"),
         (lambda m: m.update(plan="fast"), r"memory\.plan"),

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from decision import MEMORY, PLAN_STEPS, Decisions, Mode, Origin
+from decision import MEMORY, PLAN_STEPS, Decisions, Mode, Origin, next_of_plan
 from filter import BarrierFilter, FilterConfig, FilterInputError
 
 REPLACED = (Origin.BARRIER, Origin.CIRCULATION, Origin.SEARCH, Origin.PLAN, Origin.HARM)
@@ -41,7 +41,7 @@ def pressed(robot_filter):
 def remembered(draw):
     """A memory (1,) of whatever kind."""
     memory = np.zeros(1, MEMORY)
-    memory["side"], memory["guided"] = draw(st.integers(-50, 50)), draw(st.integers(0, 1))
+    memory["side"], memory["guided"] = draw(st.integers(-50, 50)), draw(st.integers(-1, 1))
     memory["left"] = draw(st.integers(0, PLAN_STEPS))
     memory["plan"][0, : memory["left"][0]] = draw(controls)
     return memory
@@ -100,17 +100,30 @@ def test_a_passing_action_is_the_nominal_one_bit_for_bit(robot_filter, scenes):
 
 
 @pytest.mark.parametrize("scanned", [False, True])
-def test_one_more_step_along_the_plan_is_certified_again(robot_filter, scenes, scanned):
-    # What is left of a certified backup is a certified backup: the plan's next action passes, or what the
-    # filter puts in its place has a certificate as well.
+def test_the_plan_goes_on_to_be_certified(robot_filter, hand, scenes, scanned):
+    # What is left of a certified backup is a certified backup, of the true robot as well.
     observation, action, hazards = scenes(300, seed=9)
     first = robot_filter.filter(observation, action, None if scanned else hazards)
-    sound = first.mode != Mode.FALLBACK
-    assert (first.memory["left"][sound] >= 0).all()
-    assert (first.memory["left"] <= PLAN_STEPS).all()
+    assert ((first.memory["left"] >= 0) & (first.memory["left"] <= PLAN_STEPS)).all()
     assert (np.abs(first.memory["plan"][..., 0]) <= 0.05 + 1e-12).all()
-    beyond = np.arange(PLAN_STEPS)[None] >= first.memory["left"][:, None]
-    assert (first.memory["plan"][beyond] == 0.0).all()
+    assert (np.abs(first.memory["plan"][..., 1]) <= 1.0).all()
+    state = np.zeros((300, 6))
+    state[:, 3:5], state[:, 5] = observation[:, 3:5], observation[:, 8]
+    memory, sound = first.memory, np.flatnonzero(first.mode != Mode.FALLBACK)
+    state, action = hand.advance_exactly(state, first.action)[0], None
+    for _ in range(4):
+        seen = np.array([hand.in_body_frame(state[k], hazards[k]) for k in sound])
+        motion = [
+            hand.in_body_frame(np.array([0.0, 0.0, state[k, 2]]), state[k, None, 3:5])[0] for k in sound
+        ]
+        now = np.array(
+            [hand.observe(at, tuple(v), state[k, 5]) for at, v, k in zip(seen, motion, sound, strict=True)]
+        )
+        action, memory = next_of_plan(memory)
+        decided = robot_filter.filter(now, action[sound], None if scanned else seen, memory[sound])
+        assert (decided.origin != Origin.HARM).all()
+        assert (decided.mode == Mode.NOMINAL).mean() > 0.8
+        state = hand.advance_exactly(state, action)[0]
 
 
 def test_a_batch_gives_what_single_robots_get(robot_filter, scenes):

@@ -53,8 +53,8 @@ def test_whom_each_strength_leads_and_no_violation(guided, hand, drive, strength
             assert (decided.memory["guided"] == 0).all()
         if strength == "refusal":
             # Only who was refused before and is not past yet; whoever begins to be led is refused.
-            assert (before["guided"][over] == 1).all()
-            begins = (decided.memory["guided"] > 0) & (before["guided"] == 0)
+            assert (before["guided"][over] != 0).all()
+            begins = (decided.memory["guided"] != 0) & (before["guided"] == 0)
             assert not certified[begins].any()
     assert (modes[Mode.GUIDED] > 0) == (strength != "off")
     assert (replaced > 0) == (strength != "off")
@@ -161,7 +161,7 @@ def test_a_batch_is_led_as_its_robots_alone(guided, hand):
     observation = np.array([hand.observe(at, (rng.uniform(0, 0.8), 0.0), 0.0, (1.8, 0.0)) for at in hazards])
     action = np.tile([1.0, 0.0], (n, 1))
     memory = np.zeros(n, MEMORY)
-    memory["guided"], memory["side"] = rng.integers(0, 2, n), rng.integers(-50, 51, n)
+    memory["guided"], memory["side"] = rng.integers(-1, 2, n), rng.integers(-50, 51, n)
     for strength in STRENGTHS:
         for source in (hazards, None):
             together = guided[strength].filter(observation, action, source, memory)

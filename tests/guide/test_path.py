@@ -49,7 +49,7 @@ def test_the_line_to_a_tangent_point_touches_the_disc(x, y, radius, side):
 def test_the_first_leg_of_a_way_that_was_found_is_free(some):
     all_discs = discs(*[(x, y, r) for (x, y), r in some])
     way = shortest_path(all_discs, len(all_discs), (3.0, 0.0), (0.0, 0.0), 0, 0.5)
-    hit, distance = first_hit(all_discs, len(all_discs), 0.0, 0.0, 3.0, 0.0, -1)
+    hit, _ = first_hit(all_discs, len(all_discs), 0.0, 0.0, 3.0, 0.0, -1)
     assert way.blocker == hit
     if way.side != 0:
         # It may graze the disc that it goes past.

