@@ -20,11 +20,12 @@ import numpy as np
 import tyro
 from numpy.typing import NDArray
 
-from decision import MEMORY, Origin
+from decision import MEMORY, Decisions, Origin
 from filter import BarrierFilter, FilterConfig
 from guide import DEFAULT_STRENGTH, STRENGTHS, Guide, Strength
 from pointgoal import seeds
 from pointgoal.lidar import encode, nearest
+from pointgoal.loop import drive
 from pointgoal.observation import HAZARD_RADIUS, LIDAR_RANGE, layout
 from pointgoal.seeds import Use
 
@@ -216,60 +217,53 @@ def _run(line: Line, rows: list[int], rng: np.random.Generator) -> Outcome:
     policy = POLICIES[line.policy] if line.policy in POLICIES else bundle_policy(Path(line.policy))
     robot_filter = BarrierFilter(world.config, Guide(world.config, line.guide))
     env = make_environments(world.level, n, world.off)
-    observation, _ = env.reset(seed=rows)
-    returns, costs = np.zeros(n), np.zeros(n)
+    returns, costs, spent = np.zeros(n), np.zeros(n), 0.0
     violations = np.zeros(n, dtype=np.int64)
-    alive = np.ones(n, dtype=bool)
     counts: Counter[str] = Counter()
     least = np.inf
-    spent = 0.0
     memory = np.zeros(n, MEMORY)
     off = world.off[0]
     noisy = off.distance + off.bearing + off.speed > 0.0
-    for _ in range(EPISODE_STEPS):
+    decided: Decisions | None = None
+
+    def act(observation: FloatArray, env: Any) -> FloatArray:
+        nonlocal memory, decided, spent
         hazards = env.hazards_in_body_frame()
         seen, shown = _perturbed(observation, hazards, off, rng) if noisy else (observation, hazards)
         action = np.clip(policy(seen, shown, rng), -1.0, 1.0)
-        if line.gate != "none":
-            start = time.perf_counter()
-            view = robot_filter.look(seen, shown if line.source == "given" else None)
-            active = np.ones(n, bool) if line.gate == "always" else view.low
-            decided = robot_filter.decide(view, action, memory, active)
-            spent += time.perf_counter() - start
-            action = decided.action
-            if line.memory:
-                memory = decided.memory
+        if line.gate == "none":
+            return action
+        start = time.perf_counter()
+        view = robot_filter.look(seen, shown if line.source == "given" else None)
+        active = np.ones(n, bool) if line.gate == "always" else view.low
+        decided = robot_filter.decide(view, action, memory, active)
+        spent += time.perf_counter() - start
+        memory = decided.memory if line.memory else memory
+        return decided.action
+
+    for step in drive(env, act, rows):
+        alive = step.running
+        returns[alive] += step.reward[alive]
+        costs[alive] += step.cost[alive]
+        edge = _nearest_edge(step.after)
+        # At level 2 vases cost as well, and a step with a cost need not be one in a hazard.
+        violations[alive] += (edge < 0.0 if world.level == 2 else step.cost > 0.0)[alive]
+        least = min(least, float(edge[alive].min(initial=np.inf)))
+        if decided is not None:
             counts["open"] += int((decided.gate_open & alive).sum())
             counts["replaced"] += int((decided.certified & (decided.origin != "") & alive).sum())
-            counts.update(dict(zip(*np.unique(decided.origin[alive], return_counts=True), strict=True)))
-        observation, reward, terminated, truncated, info = env.step(action)
-        returns[alive] += reward[alive]
-        costs[alive] += info["cost"][alive]
-        edge = _nearest_edge(observation, info)
-        # At level 2 vases cost as well, and a step with a cost need not be one in a hazard.
-        inside = edge < 0.0 if world.level == 2 else info["cost"] > 0.0
-        violations[alive] += inside[alive]
-        least = min(least, float(edge[alive].min(initial=np.inf)))
-        alive &= ~(terminated | truncated)
-        if not alive.any():
-            break
+            counts.update(f"by {origin}" for origin in decided.origin[alive].tolist())
     env.close()
     steps = n * EPISODE_STEPS
     shares = {name: counts[name] / steps for name in SHARES}
     return Outcome(returns, costs, violations, shares, least, spent / steps)
 
 
-def _nearest_edge(observation: FloatArray, info: dict[str, Any]) -> FloatArray:
-    """Distance (N,) from the nearest hazard's edge after a step [m], from the true scans.
-
-    Where an episode ended, the positions and the observation are the next one's; the last one's scan is kept.
-    """
-    seen = observation
-    if "final_obs" in info:
-        seen = np.where(info["_final_obs"][:, None], info["final_obs"], observation)
-    if seen.shape[1] == layout(0).size:
-        return np.full(len(seen), np.inf)
-    strongest = seen[:, layout(1).slice("hazards_lidar")].max(axis=1)
+def _nearest_edge(observation: FloatArray) -> FloatArray:
+    """Distance (N,) from the nearest hazard's edge [m], from the true scans."""
+    if observation.shape[1] == layout(0).size:
+        return np.full(len(observation), np.inf)
+    strongest = observation[:, layout(1).slice("hazards_lidar")].max(axis=1)
     return np.asarray(LIDAR_RANGE * (1.0 - strongest) - HAZARD_RADIUS)
 
 
@@ -279,7 +273,7 @@ POLICIES: dict[str, Policy] = {
     "attacker": attacker_policy,
     "seeker": seeker_policy,
 }
-SHARES = ("open", *(origin.value for origin in Origin), "replaced")
+SHARES = ("open", *(f"by {origin}" for origin in Origin), "replaced")
 """What is counted of the steps."""
 
 
@@ -315,20 +309,22 @@ WORLDS = {
 }
 SHIPPED, REWARD_ONLY = "models/pointgoal1", "models/ppo1"
 SOURCES: tuple[Source, ...] = ("given", "lidar")
+GATES: tuple[Gate, ...] = ("always", "floor", "none")
 
 
 def lines() -> Iterator[Line]:
-    """What docs/filter.md shows."""
-    policies = (REWARD_ONLY, SHIPPED, "random", "thrust", "attacker")
-    for policy in policies:
+    """What docs/filter.md shows, what matters most first."""
+    policies = (REWARD_ONLY, "random", "thrust", "attacker")
+    for source, policy, strength in itertools.product(SOURCES, (SHIPPED, REWARD_ONLY), STRENGTHS):
+        yield Line(policy, "plain", source, "always", strength)
+    for world in ("plain", "off", "noise", "level 2"):
+        for gate, policy, source in itertools.product(GATES[:2], policies, SOURCES):
+            if (world, gate, policy) != ("plain", "always", REWARD_ONLY):
+                yield Line(policy, world, source, gate, DEFAULT_STRENGTH)
+    for source in SOURCES:
+        yield Line(SHIPPED, "plain", source, "floor", DEFAULT_STRENGTH)
+    for policy in (*policies, SHIPPED):
         yield Line(policy, "plain", "given", "none", "off")
-    for gate, world in itertools.product(("always", "floor"), ("plain", "off", "noise", "level 2")):
-        for policy, source in itertools.product(policies, SOURCES):
-            if policy != SHIPPED or world == "plain":
-                yield Line(policy, world, source, gate, DEFAULT_STRENGTH)  # type: ignore[arg-type]
-    for policy, source, strength in itertools.product((SHIPPED, REWARD_ONLY), SOURCES, STRENGTHS):
-        if strength != DEFAULT_STRENGTH:
-            yield Line(policy, "plain", source, "always", strength)
     for policy, source in itertools.product((REWARD_ONLY, "attacker"), SOURCES):
         yield Line(policy, "plain", source, "always", DEFAULT_STRENGTH, memory=False)
     for world, source in itertools.product(list(WORLDS)[5:], SOURCES):
@@ -389,7 +385,7 @@ def table(rows: list[dict[str, str]]) -> str:
     shares = ("open", "QP", "search", "plan", "least harm", "guide", "replaced")
     lines = [f"| {' | '.join((*head, *shares))} |", "|---" * (len(head) + len(shares)) + "|"]
     for row in rows:
-        percent = {name: 100 * float(row[name]) for name in SHARES}
+        percent = {name.removeprefix("by "): 100 * float(row[name]) for name in SHARES}
         percent["QP"] = percent["barrier"] + percent["circulation"]
         world = row["world"] + ("" if row["memory"] == "True" else ", no memory")
         names = (Path(row["policy"]).name, world, row["source"], row["gate"], row["guide"])

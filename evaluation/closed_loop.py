@@ -6,13 +6,13 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import dataclass, fields
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import gymnasium
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from decision import MEMORY, Decision, Decisions, Memory, Mode, OpenedBy, Origin
+from decision import MEMORY, BatchDecider, Decisions, Memory, Mode, OpenedBy, Origin
 from pointgoal import seeds
 from pointgoal.loop import SIDE_BY_SIDE, Step, drive, groups, side_by_side
 from pointgoal.seeds import Use
@@ -30,20 +30,6 @@ _TIMED_STATES = 1000
 
 class TaskError(ValueError):
     """A task that is not there, or not one of point robots."""
-
-
-class Decides(Protocol):
-    """What decides: `monitor.Monitor` in this process, `server.Fleet` through a service."""
-
-    def decide(
-        self, observation: ArrayLike, hazards: ArrayLike | None = None, memory: Memory | np.void | None = None
-    ) -> Decision:
-        """Decides for one robot: observation (O,), hazards (n, 2) [m] or None, its memory."""
-
-    def decide_batch(
-        self, observation: ArrayLike, hazards: ArrayLike | None = None, memory: Memory | None = None
-    ) -> Decisions:
-        """Decides for N robots: observation (N, O), hazards (N, n, 2) [m] or None, their memory (N,)."""
 
 
 @dataclass(frozen=True)
@@ -119,7 +105,7 @@ class Episodes:
 
 def run_episodes(
     task: str,
-    decider: Decides,
+    decider: BatchDecider,
     episodes: int,
     seed: int = 0,
     hazards: HazardSource = "lidar",
@@ -176,7 +162,7 @@ class _State:
     memory: np.void
 
 
-def timed(decider: Decides, states: Iterator[_State]) -> Iterator[float]:
+def timed(decider: BatchDecider, states: Iterator[_State]) -> Iterator[float]:
     """How long a decision takes [s]: `decide` as one robot calls it, on one state after the other.
 
     The first state is decided once before, untimed: a connection may have to be opened. Through a service
@@ -206,7 +192,7 @@ class _Robots:
     decisions: Decisions
 
     def __init__(
-        self, decider: Decides, source: HazardSource, count: int, recording: _Recording | None
+        self, decider: BatchDecider, source: HazardSource, count: int, recording: _Recording | None
     ) -> None:
         self._decider = decider
         self._source = source

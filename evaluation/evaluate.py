@@ -15,7 +15,8 @@ from typing import Annotated, Any, Literal
 import tyro
 from rich.console import Console
 
-from evaluation.closed_loop import Decides, Episodes, HazardSource, TaskError, run_episodes
+from decision import BatchDecider
+from evaluation.closed_loop import Episodes, HazardSource, TaskError, run_episodes
 from evaluation.errors import EvaluateError, ServiceError, ServiceGoneError
 from evaluation.progress import progress_bar
 from evaluation.statistics import summarise
@@ -101,7 +102,7 @@ def evaluate(config: EvaluateConfig, console: Console) -> tuple[Runs, dict[str, 
 
 
 @contextmanager
-def _decider(config: EvaluateConfig, bundle: Bundle) -> Iterator[tuple[Decides, dict[str, Any]]]:
+def _decider(config: EvaluateConfig, bundle: Bundle) -> Iterator[tuple[BatchDecider, dict[str, Any]]]:
     """What decides, and how it calls itself: model, gate, threshold, guide."""
     if config.url is None:
         guide = config.guide or DEFAULT_STRENGTH

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from evaluation.closed_loop import Decides
+from decision import BatchDecider
 from evaluation.errors import ServiceError
 from evaluation.watched import Watched
 from server import ClientError, Fleet, ModelReply
@@ -17,7 +17,7 @@ from server.serve import ServeError, read_api_key
 @contextmanager
 def asked(
     url: str, layout: Sequence[dict[str, Any]], timeout: float, key_file: Path | None = None
-) -> Iterator[tuple[Decides, ModelReply]]:
+) -> Iterator[tuple[BatchDecider, ModelReply]]:
     """What decides through a service, and what the service says about itself.
 
     Args:

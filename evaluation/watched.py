@@ -8,8 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from decision import Decision, Decisions, Memory
-from evaluation.closed_loop import Decides
+from decision import BatchDecider, Decision, Decisions, Memory
 from evaluation.errors import ServiceError, ServiceGoneError
 
 _MEASURED = ("bad input", "time-out")
@@ -24,7 +23,7 @@ class Faults(Protocol):
         """Kind → how many there were."""
 
 
-class Asks(Decides, Protocol):
+class Asks(BatchDecider, Protocol):
     """Decides through a service; `server.Fleet` is one."""
 
     @property

@@ -119,16 +119,7 @@ class BarrierFilter:
     def problem(
         self, observation: ArrayLike, nominal_action: ArrayLike, hazards: ArrayLike | None = None
     ) -> Problem | None:
-        """The first QP of one robot that has no memory; None if its nominal action passes.
-
-        Args:
-            observation: (60,) or (28,).
-            nominal_action: (2,).
-            hazards: (n, 2) in the body frame [m], or None.
-
-        Raises:
-            FilterInputError: if an input has a wrong shape or a value that is not finite.
-        """
+        """The first QP of one robot without memory, None if its action passes; arguments as for `filter`."""
         view = self.look(
             np.asarray(observation)[None], None if hazards is None else np.asarray(hazards)[None]
         )

@@ -30,14 +30,8 @@ def certify(
 ) -> tuple[float, int, int, int]:
     """How far the robot surely stays from every obstacle if it takes an action now and a backup afterwards.
 
-    Args:
-        settings: the filter's numbers.
-        obstacles: (M, COLUMNS), radii with the margin.
-        count: how many of them there are.
-        state: the measured state.
-        thrust: u1.
-        turn: u2.
-        enough: stop looking at a clearance of this much [m]; 0 asks only whether the action is certified.
+    ``thrust`` and ``turn`` are u1 and u2; a clearance of ``enough`` [m] is not looked beyond: 0 asks only
+    whether the action is certified.
 
     Returns:
         The clearance [m], at or above 0 if the action is certified; the obstacle that bounds it; the backup;

@@ -36,11 +36,12 @@ class FilterConfig:
     travel_error: float = 0.0
     """Bound on how far a backup manoeuvre strays from the model's, as a share of its way."""
     hazard_radius: float | None = None
-    """Radius of every hazard [m]."""
+    """Radius of every hazard [m]; None: the bundle's, or without one the task's."""
     rate: float = 0.5
     """Share of a barrier that the QP lets one control step take away, in (0, 1]; 1 brakes last."""
-    keep_off: float = 0.005
-    """Clearance that the QP drives back to [m]: at the very margin the robot could not even turn."""
+    keep_off: float = 0.02
+    """Clearance below which a barrier row lets none of it be lost [m]: at the very margin the robot could
+    not even turn, for it turns about its centre of mass."""
     hysteresis: float = 0.001
     """Clearance beyond the margin that a nominal action must leave, and a backup need not [m]."""
     thrust_weight: float = 4.0
@@ -55,7 +56,7 @@ class FilterConfig:
     solver: str = "planar"
     """QP solver: "planar" (ours), "osqp" (kept workspace) or any that qpsolvers knows."""
     robot: Robot | None = None
-    """The robot's constants."""
+    """The robot's constants; None: the bundle's, or without one the task's."""
 
     def __post_init__(self) -> None:
         """Refuse settings that void the guarantee."""

@@ -49,6 +49,7 @@ COMMITTED, UNKEPT, INSIDE = 0, 1, 2
 """What `recover` finds: a backup that keeps the inner margin; one that does not; a robot inside a hazard."""
 _GRID = 5
 """Thrusts, and turns, that the search tries."""
+_LARGEST = float(np.finfo(np.float32).max)
 _STANDS = 0.03
 """Way to the stop point up to which a robot stands [m]: 6 cm/s."""
 _THRUST_TIME = 0.02 * (PLAN_STEPS + 1)
@@ -99,17 +100,17 @@ def see(
 ) -> int:
     """Find all robots' obstacles and backups; the last three arguments receive them.
 
-    ``columns`` tells where in an ``observation`` (N, O) the velocity ahead, followed by that to the left, and
-    the yaw rate stand, where the hazards' lidar starts and ends, and where the goal's starts. ``given`` (N, n,
-    2) are hazards [m]; ``source`` (N, M) receives each obstacle's hazard, or n + its bin. Returns the place of
-    the first number of all observations that is not finite, -1 if there is none.
+    ``columns`` tells where in an ``observation`` (N, O) the velocity ahead, followed by that to the left,
+    and the yaw rate stand, where the hazards' lidar starts and ends, and where the goal's starts. ``given``
+    (N, n, 2) are hazards [m]; ``source`` (N, M) receives each obstacle's hazard, or n + its bin. Returns the
+    place of the first number of all observations that float32 cannot hold, -1 if there is none.
     """
     config = settings[0]
     velocity, yaw, first, last, _ = columns
     for k in range(observation.shape[0]):
         for i in range(observation.shape[1]):
-            if not math.isfinite(observation[k, i]):
-                return k * observation.shape[1] + i
+            if not abs(observation[k, i]) <= _LARGEST:
+                return int(k * observation.shape[1] + i)
         one = seen[k]
         one.vx = observation[k, velocity]
         one.vy = observation[k, velocity + 1]
@@ -140,8 +141,8 @@ def screen(
 ) -> int:
     """Look for certificates of the nominal actions (N, 2) where the gate is open; how many have none.
 
-    Where ``active`` (N,) is False, the sure backup stands for one. ``certified`` (N,) receives which have one;
-    a remembered ``side`` (N,) fades; ``left`` (N,) and ``plan`` (N, PLAN_STEPS, 2) receive the plans.
+    Where ``active`` (N,) is False, the sure backup stands for one. ``certified`` (N,) receives which have
+    one; a remembered ``side`` (N,) fades; ``left`` (N,) and ``plan`` (N, PLAN_STEPS, 2) receive the plans.
     """
     config = settings[0]
     refused = 0

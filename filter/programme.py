@@ -43,11 +43,7 @@ class Programme:
         self._circulating = circulating & (step.settings["circulation"][0] > 0.0)
 
     def linearise(self, trust: float) -> None:
-        """Build the QPs, linearised about the last solutions or near the best backups' actions.
-
-        Args:
-            trust: 0, or how near; see `kernel.linearise`.
-        """
+        """Build the QPs, about the last solutions or near the backups' actions; see `kernel.linearise`."""
         step, n = self._step, len(self.rows)
         scene = step.scene
         most = int(scene.seen["count"][self.rows].max()) + 5

@@ -82,22 +82,11 @@ def barrier_rows(
     h: FloatArray,
     work: FloatArray,
 ) -> int:
-    """Write the barrier rows of one robot's QP.
+    """Write the barrier rows of one robot's QP; how many there are.
 
-    Args:
-        settings: the filter's numbers.
-        obstacles: (M, COLUMNS), radii with the margin.
-        count: how many of them there are.
-        state: the measured state.
-        now: (>= M,) each obstacle's clearance under the present state's best backup [m].
-        about: (2,) where to linearise.
-        backup: whose clearances the rows are about, and for how many steps it thrusts after the step.
-        G: (>= M, 2) receives the rows that can bind in the box.
-        h: (>= M,) receives their right-hand sides.
-        work: (3, >= M) scratch.
-
-    Returns:
-        How many rows there are.
+    They are linearised about ``about`` (2,), for a ``backup`` and the steps that it thrusts after the step.
+    ``now`` (>= M,) is each obstacle's clearance under the present state's best backup [m]; ``G`` (>= M, 2)
+    and ``h`` (>= M,) receive the rows that can bind in the box; ``work`` (3, >= M) is scratch.
     """
     f, w = about
     df = _PROBE if f < 0.0 else -_PROBE

@@ -108,14 +108,7 @@ def commit(
     """The action, of the backups' first ones and the extremes, that leaves a backup the most clearance.
 
     What the robot is too near to now counts no more, so from a place within the margin it leads out. Actions
-    that keep a clearance on their whole way go before those that do not.
-
-    Args:
-        settings: the filter's numbers.
-        obstacles: (M, COLUMNS), radii with the margin.
-        count: how many of them there are.
-        state: the measured state.
-        least: the clearance to keep [m].
+    that keep a clearance ``least`` [m] on their whole way go before those that do not.
 
     Returns:
         The action (u1, u2); whether it keeps that clearance; the backup that it ends in, and that one's steps

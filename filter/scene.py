@@ -85,13 +85,8 @@ class Scene:
 def look(settings: NDArray[np.void], observation: FloatArray, given: FloatArray | None) -> Scene:
     """Find obstacles and best backups.
 
-    Args:
-        settings: (1,) of `SETTINGS`.
-        observation: (N, 60) or (N, 28).
-        given: (N, n, 2) hazards [m]; None: none are given.
-
-    Raises:
-        FilterInputError: if the observation has a value that is not finite.
+    ``observation`` is (N, 60) or (N, 28), ``given`` (N, n, 2) hazards [m] or None; a value of the observation
+    that is not finite raises FilterInputError.
     """
     n, width = observation.shape
     columns = _COLUMNS[width]
@@ -102,16 +97,12 @@ def look(settings: NDArray[np.void], observation: FloatArray, given: FloatArray 
     obstacles, source = np.empty((n, size, COLUMNS)), np.empty((n, size), dtype=np.int64)
     bad = see(settings, observation, columns.read, given, seen, obstacles, source)
     if bad >= 0:
-        raise FilterInputError(f"observation[{bad % width}]", f"is {observation.flat[bad]}")
+        raise FilterInputError(f"observation[{bad % width}]", f"must be finite, got {observation.flat[bad]}")
     return Scene(observation, columns.read, given, seen, obstacles, source)
 
 
 def check_observation(observation: ArrayLike) -> FloatArray:
-    """(N, 60) or (N, 28).
-
-    Raises:
-        FilterInputError: if it is not.
-    """
+    """(N, 60) or (N, 28), or FilterInputError."""
     checked = _array("observation", observation)
     if checked.ndim != 2 or checked.shape[1] not in _COLUMNS:
         sizes = " or ".join(f"(N, {size})" for size in sorted(_COLUMNS, reverse=True))
@@ -120,11 +111,7 @@ def check_observation(observation: ArrayLike) -> FloatArray:
 
 
 def check_action(action: ArrayLike, n: int) -> FloatArray:
-    """(N, 2), clipped to ±1.
-
-    Raises:
-        FilterInputError: if it is not, or has a value that is no number.
-    """
+    """(N, 2), clipped to ±1, or FilterInputError, also for a value that is not finite."""
     checked = _array("nominal_action", action)
     if checked.shape != (n, 2):
         raise FilterInputError("nominal_action", f"expected shape ({n}, 2), got {checked.shape}")
@@ -134,11 +121,7 @@ def check_action(action: ArrayLike, n: int) -> FloatArray:
 
 
 def check_hazards(hazards: ArrayLike | None, n: int) -> FloatArray | None:
-    """(N, n, 2) or None.
-
-    Raises:
-        FilterInputError: if it is not, or has an infinite value or half a NaN.
-    """
+    """(N, n, 2) or None, or FilterInputError, also for an infinite value or half a NaN."""
     if hazards is None:
         return None
     given = _array("hazards", hazards)
@@ -151,11 +134,7 @@ def check_hazards(hazards: ArrayLike | None, n: int) -> FloatArray | None:
 
 
 def check_active(active: ArrayLike | None, n: int) -> BoolArray:
-    """(N,); None: all True.
-
-    Raises:
-        FilterInputError: if it is not.
-    """
+    """(N,), or FilterInputError; None: all True."""
     if active is None:
         return np.ones(n, dtype=np.bool_)
     gate = np.ascontiguousarray(active, dtype=np.bool_)
@@ -165,16 +144,12 @@ def check_active(active: ArrayLike | None, n: int) -> BoolArray:
 
 
 def check_memory(memory: Memory | None, n: int) -> Memory:
-    """A copy (N,) of `MEMORY`; None: a first step's.
-
-    Raises:
-        FilterInputError: if it is not that of n robots.
-    """
+    """(N,) of `MEMORY`, or FilterInputError; None: a first step's."""
     if memory is None:
         return np.zeros(n, MEMORY)
     if not isinstance(memory, np.ndarray | np.void) or memory.dtype != MEMORY or memory.size != n:
         raise FilterInputError("memory", f"expected that of {n} robots")
-    return memory.reshape(n).copy()
+    return memory.reshape(n)
 
 
 def _array(field: str, values: ArrayLike) -> FloatArray:

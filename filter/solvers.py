@@ -89,16 +89,9 @@ def solve_planar(
 
     In the variables y = sqrt(P) x the QP asks for the point nearest to the reference. The rows are taken in
     turn: if the best point so far breaks the next, the new best point lies on that row's line (Seidel 1991,
-        "Small-dimensional
-    linear programming and convex hulls made easy"; it holds for every LP-type problem).
-
-    Args:
-        weights: (2,) diagonal of P.
-        reference: (2,).
-        G: (>= rows, 2).
-        h: (>= rows,).
-        rows: how many rows there are.
-        x: (2,) receives the solution.
+    "Small-dimensional linear programming and convex hulls made easy"; it holds for every LP-type problem).
+    ``weights`` (2,) is P's diagonal; of ``G`` (m, 2) and ``h`` (m,) the first ``rows`` count; ``x`` (2,)
+    receives the solution.
 
     Returns:
         Whether the problem is feasible.
@@ -163,11 +156,7 @@ class KeptOSQP:
         self._own = threading.local()
 
     def __call__(self, problem: Problem) -> FloatArray | None:
-        """Solve one problem.
-
-        Raises:
-            SolverError: if OSQP ends with neither a solution nor infeasibility.
-        """
+        """Solve one problem, or raise SolverError if OSQP finds neither a solution nor infeasibility."""
         import osqp
 
         G, h = problem.scaled()
@@ -226,11 +215,7 @@ class KeptOSQP:
 
 
 class ByQpsolvers:
-    """A solver of qpsolvers by its name, for example "daqp", "quadprog" or "piqp".
-
-    Raises:
-        ValueError: if qpsolvers has no such solver installed.
-    """
+    """A solver of qpsolvers by its name, for example "daqp"; ValueError if it is not installed."""
 
     def __init__(self, name: str) -> None:
         import qpsolvers
@@ -241,11 +226,7 @@ class ByQpsolvers:
         self._name = name
 
     def __call__(self, problem: Problem) -> FloatArray | None:
-        """Solve one problem.
-
-        Raises:
-            SolverError: if the solver breaks down.
-        """
+        """Solve one problem, or raise SolverError if the solver breaks down."""
         import qpsolvers
 
         G, h = problem.scaled()
@@ -260,11 +241,7 @@ class ByQpsolvers:
 
 
 def make_solver(name: str) -> Solver:
-    """The solver of a name: "planar", "osqp" or one of qpsolvers'.
-
-    Raises:
-        ValueError: if there is no such solver.
-    """
+    """The solver of a name: "planar", "osqp" or one of qpsolvers'; ValueError if there is none."""
     if name == "planar":
         return planar
     if name == "osqp":
@@ -277,13 +254,7 @@ def solve_batch(
 ) -> tuple[FloatArray, BoolArray]:
     """Solve N problems.
 
-    Args:
-        solver: who solves them.
-        weights: (2,) diagonal of P.
-        reference: (N, 2).
-        G: (N, M, 2).
-        h: (N, M).
-        rows: (N,) how many rows each has.
+    ``reference`` (N, 2), ``G`` (N, M, 2) and ``h`` (N, M) are theirs; ``rows`` (N,) says how many rows count.
 
     Returns:
         The solutions (N, 2), the reference where there is none, and whether there is one (N,).

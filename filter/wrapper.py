@@ -16,14 +16,7 @@ if TYPE_CHECKING:
 
     Environment = gymnasium.Env[Any, Any] | VectorEnv[Any, Any, Any]
 
-_HARMLESS = {
-    "OrderEnforcing",
-    "PassiveEnvChecker",
-    "RecordEpisodeStatistics",
-    "RecordVideo",
-    "TimeLimit",
-    "HumanRendering",
-}
+_HARMLESS = {"OrderEnforcing", "PassiveEnvChecker", "RecordEpisodeStatistics", "RecordVideo", "TimeLimit"}
 """Wrappers of gymnasium that leave observations and actions as they are."""
 _TOLD = ("action", "mode", "origin", "barrier", "hazard", "reason")
 
@@ -46,9 +39,6 @@ def SafetyFilter(  # noqa: N802 - it is used like the class of a wrapper, and gi
         hazards: "given" takes them from the environment's ``hazards_in_body_frame``; "lidar" uses the
             observation alone.
         guide: who leads the robot round what is in its way; None: nobody does.
-
-    Returns:
-        A `gymnasium.Wrapper` or `gymnasium.vector.VectorWrapper`.
 
     Raises:
         TypeError: if ``env`` is neither kind of environment.

@@ -26,7 +26,7 @@ Strength = Literal["off", "refusal", "ahead"]
 it is past what is in its way. ahead: lead every robot that has something in its way and does not drive round
 it by itself: a planner drives then, and most of the actions that it replaces have a certificate."""
 STRENGTHS: tuple[Strength, ...] = get_args(Strength)
-DEFAULT_STRENGTH: Strength = "refusal"
+DEFAULT_STRENGTH: Strength = "ahead"
 
 
 @dataclass(frozen=True)

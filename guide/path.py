@@ -32,7 +32,7 @@ _TURN_MOTION = 0.5
 """Length that it costs to give up a metre of the way to the stop point."""
 _TURN_HEADING = 0.4
 """Length that it costs to turn by a radian [m]."""
-_ALONG = 0.7
+_ALONG = 0.5
 """Least cosine of the angle to the way round of a thrust that counts as driving round."""
 _SAME_END = 0.5
 """Cosine of the heading's error that a robot on the move puts up with before its other end leads."""

@@ -47,10 +47,8 @@ class ActionFilter(Protocol):
 class Monitor:
     """Watches one policy: `decide` turns an observation into the action to send.
 
-    It never fails open. Whatever goes wrong inside (a network gives NaN, the filter raises or answers
-    nonsense, the observation has another length) ends in mode "fallback" and the reason: the plan in the
-    robot's memory goes on for as long as it lasts, then the robot coasts. The nominal action is sent only if
-    everything that should have looked at it did.
+    It never fails open. Whatever goes wrong ends in mode "fallback" and the reason: the plan in the robot's
+    memory goes on, then the robot coasts. The nominal action is sent only if all that should look at it did.
 
     Args:
         bundle: the checked bundle.
@@ -58,9 +56,11 @@ class Monitor:
         action_filter: the filter.
         gate: when the filter is active.
         threshold: λ above which the gate `risk` opens; None takes the bundle's.
+        guide: how much the filter's guide may do, to be told.
 
     Attributes:
         faults: what went wrong so far.
+        robot: the constants of the bundle's robot.
 
     Raises:
         MonitorError: for an unknown gate, a threshold that is not finite and >= 0, or a bundle whose
@@ -74,10 +74,13 @@ class Monitor:
         action_filter: ActionFilter,
         gate: GateName = "risk",
         threshold: float | None = None,
+        guide: Strength = "off",
     ) -> None:
         _check_layout(bundle)
         manifest = bundle.manifest
         self.bundle = bundle
+        self.robot = _robot(bundle)
+        self.guide: Strength = guide
         self.faults = Faults()
         wanted = manifest.threshold if threshold is None else float(threshold)
         self.gate = Gate(gate, wanted)
@@ -117,7 +120,7 @@ class Monitor:
             networks = Networks(bundle)
         except (NetworkError, ValueError) as error:
             raise MonitorError(f"{bundle.path}: {error}") from error
-        monitor = Monitor(bundle, networks, action_filter, gate, threshold)
+        monitor = Monitor(bundle, networks, action_filter, gate, threshold, guide)
         monitor._warm_up()
         return monitor
 
@@ -137,8 +140,7 @@ class Monitor:
         """
         past = np.zeros(1, MEMORY)
         try:
-            if memory is not None:
-                past = _one_robots_memory(memory)
+            past = _memory_of(1, memory)
             row = np.array(observation, dtype=np.float64)[None]
             given = None if hazards is None else _one_robots_hazards(hazards)
         except (TypeError, ValueError) as error:
@@ -159,9 +161,8 @@ class Monitor:
             memory: the `memory` of these robots' last decisions, or None.
 
         Raises:
-            ValueError: if the observation is not an array (N, O) of numbers, for then N is unknown, or the
-                hazards or the memory are not those of N robots. A fault in one robot's row gives that robot
-                the fallback and leaves the others alone.
+            ValueError: if the observation is not an array (N, O) of numbers, or the hazards or the memory are
+                not those of N robots. A fault in one row gives that robot alone the fallback.
         """
         rows = np.array(observation, dtype=np.float64)
         if rows.ndim != 2:
@@ -171,11 +172,7 @@ class Monitor:
         given = None if hazards is None else np.asarray(hazards, dtype=np.float64)
         if given is not None and (given.ndim != 3 or given.shape[::2] != (len(rows), 2)):
             raise ValueError(f"hazards must have shape [{len(rows)}, n, 2], got {given.shape}")
-        if memory is None:
-            memory = np.zeros(len(rows), MEMORY)
-        elif getattr(memory, "dtype", None) != MEMORY or memory.shape != (len(rows),):
-            raise ValueError(f"memory is not that of {len(rows)} robots")
-        return self._decide_or_fall_back(rows, given, memory)
+        return self._decide_or_fall_back(rows, given, _memory_of(len(rows), memory))
 
     def _decide_or_fall_back(
         self, observation: FloatArray, hazards: FloatArray | None, memory: Memory
@@ -202,6 +199,8 @@ class Monitor:
             raise FilterInputError("observation", f"must have {size} numbers, got {observation.shape[1:]}")
         scene = self._filter.look(observation, hazards)
         nominal, risk = self._networks.run(observation)
+        if nominal.shape != (len(observation), 2) or risk.shape != nominal.shape[:1]:
+            raise NetworkError(f"the networks gave shapes {nominal.shape} and {risk.shape}")
         sound = np.empty(len(risk), np.bool_)
         all_sound = within(nominal, self._low, self._high, risk, sound)
         opened_by = self.gate.opened_by(risk, scene.low)
@@ -315,10 +314,13 @@ def _one_robots_hazards(hazards: ArrayLike) -> FloatArray:
     return given[None]
 
 
-def _one_robots_memory(memory: Memory | np.void) -> Memory:
-    if getattr(memory, "dtype", None) != MEMORY or memory.size != 1:
-        raise ValueError("the memory is not that of one robot")
-    return np.asarray(memory).reshape(1)
+def _memory_of(count: int, memory: Memory | np.void | None) -> Memory:
+    """The memory (count,) of so many robots; None is that before a first step."""
+    if memory is None:
+        return np.zeros(count, MEMORY)
+    if getattr(memory, "dtype", None) != MEMORY or memory.size != count:
+        raise ValueError(f"the memory is not that of {count} robots")
+    return np.asarray(memory).reshape(count)
 
 
 def _check_layout(bundle: Bundle) -> None:

@@ -17,8 +17,8 @@ _ROUNDING = 1e-6
 class Networks:
     """Policy and multiplier network of one bundle.
 
-    One intra-op thread without spinning: for networks this small a thread pool costs more than it computes,
-    and its spinning takes the core that the robot's other software needs.
+    One intra-op thread without spinning: for networks this small a pool costs more than it computes, and
+    spinning takes the core that the robot's other software needs.
 
     Args:
         bundle: a checked bundle.
@@ -40,18 +40,10 @@ class Networks:
 
         Returns:
             nominal action [N, 2] and risk score λ_ξ(s) [N] (paper eq. 14).
-
-        Raises:
-            NetworkError: if a network gives another shape; whatever onnxruntime raises if it fails.
         """
         feed = {"observation": observation.astype(np.float32)}
         action = self._policy.run(["action"], feed)[0]
         risk = self._multiplier.run(["multiplier"], feed)[0]
-        expected = len(observation)
-        if action.shape != (expected, 2) or risk.shape != (expected,):
-            raise NetworkError(
-                f"the networks gave shapes {action.shape} and {risk.shape} for {expected} observations"
-            )
         return action.astype(np.float64), risk.astype(np.float64)
 
 
@@ -73,14 +65,8 @@ def within(
 ) -> bool:
     """Which of N actions and scores are numbers within their bounds; whether all are.
 
-    Such an action has float32's rounding clipped off: onnxruntime's tanh, for one, reaches 1.0000001.
-
-    Args:
-        action: [N, a] of the policy; clipped in place where it is sound.
-        low: [a].
-        high: [a].
-        risk: [N], sound from 0 on.
-        sound: [N] receives which are.
+    Such an ``action`` (N, a) has float32's rounding clipped off, in place: a tanh can reach 1.0000001. A
+    ``risk`` (N,) is one from 0 on; ``sound`` (N,) receives which are.
     """
     for k in range(len(action)):
         sound[k] = 0.0 <= risk[k] < np.inf

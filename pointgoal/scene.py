@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import mujoco
+import numpy as np
 
 from pointgoal.observation import NUM_VASES
 
@@ -61,6 +62,31 @@ def build_scene(level: int, sleep: bool = True) -> mujoco.MjModel:
             condim=6,
         )
     return spec.compile()
+
+
+def robot_constants(model: mujoco.MjModel) -> dict[str, float | int]:
+    """The robot's constants as MuJoCo compiled them, named as `system.Robot` names them.
+
+    Args:
+        model: a scene's.
+    """
+    body, thrust = model.body("robot"), model.actuator("thrust")
+    mass, offset = float(body.mass[0]), float(body.ipos[0])
+    # The principal axes may stand in any order: the moment about the vertical one, then about the origin.
+    rotation = np.zeros(9)
+    mujoco.mju_quat2Mat(rotation, body.iquat)
+    about_centre = float(rotation.reshape(3, 3)[2] ** 2 @ body.inertia)
+    return {
+        "mass": mass,
+        "inertia": about_centre + mass * offset**2,
+        "offset": offset,
+        "drag": float(model.dof_damping[model.joint("x").dofadr[0]]),
+        "yaw_drag": float(model.dof_damping[model.joint("heading").dofadr[0]]),
+        "gear": float(thrust.gear[0]),
+        "force_limit": float(thrust.forcerange[1]),
+        "physics_step": float(model.opt.timestep),
+        "substeps": PHYSICS_STEPS,
+    }
 
 
 def _add_robot(spec: mujoco.MjSpec) -> None:

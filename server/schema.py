@@ -218,7 +218,6 @@ class ModelReply(BaseModel):
         gate: when the filter is active: risk, always, off.
         threshold: the gate `risk` activates the filter where the risk score is above this.
         threshold_source: how the bundle's threshold was set.
-        floor: the gate `risk` activates the filter where the barrier is below this [m].
         guide: how much the guide may do: off, refusal, ahead.
     """
 
@@ -236,15 +235,13 @@ class ModelReply(BaseModel):
     gate: str
     threshold: Finite
     threshold_source: str
-    floor: Finite
     guide: str
 
     @classmethod
     def of(cls, monitor: Monitor) -> Self:
         """The reply that tells what a monitor runs."""
         manifest = monitor.bundle.manifest
-        gate, robot = monitor.gate, monitor._filter.config.robot
-        guide = getattr(monitor._filter, "guide", None)
+        gate = monitor.gate
         overridden = gate.threshold != manifest.threshold
         return cls(
             model=monitor.bundle.id,
@@ -257,10 +254,9 @@ class ModelReply(BaseModel):
             action_low=list(manifest.action_low),
             action_high=list(manifest.action_high),
             hazard_radius=manifest.hazard_radius,
-            robot={} if robot is None else robot._asdict(),
+            robot=monitor.robot._asdict(),
             gate=gate.name,
             threshold=gate.threshold,
             threshold_source="set when the service was started" if overridden else manifest.threshold_source,
-            floor=gate.floor,
-            guide=getattr(guide, "strength", "off"),
+            guide=monitor.guide,
         )

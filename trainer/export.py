@@ -21,6 +21,7 @@ from rich.console import Console
 from models import BundleError, Manifest, ObservationBlock, write_bundle
 from pointgoal import seeds
 from pointgoal.observation import HAZARD_RADIUS, layout
+from pointgoal.scene import build_scene, robot_constants
 from pointgoal.seeds import Use
 from trainer import checkpoint, onnx_graph
 from trainer.actions import ActionRange
@@ -175,6 +176,7 @@ def export(config: ExportConfig) -> Manifest:
         threshold=threshold.value,
         threshold_source=threshold.source,
         hazard_radius=HAZARD_RADIUS,
+        robot=robot_constants(build_scene(level)),
         opset=onnx_graph.OPSET,
         training={k: v for k, v in dataclasses.asdict(run.config).items() if k not in {"out", "resume"}},
         figures=_figures(played) | {"steps": float(run.steps)} | differences,
