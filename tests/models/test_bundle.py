@@ -59,6 +59,18 @@ def test_the_id_changes_with_anything_in_the_bundle(own_bundle: Path) -> None:
     assert Bundle.load(own_bundle).id != before
 
 
+def test_the_robots_constants_are_kept_as_they_are_written(own_bundle: Path) -> None:
+    assert Bundle.load(own_bundle).manifest.robot == {}
+    edit_manifest(own_bundle, lambda m: m.pop("robot"))
+    assert Bundle.load(own_bundle).manifest.robot == {}  # bundles from before it
+    constants = {"mass": 0.0051887900000000001, "substeps": 10}
+    edit_manifest(own_bundle, lambda m: m.update(robot=constants))
+    loaded = Bundle.load(own_bundle).manifest
+    assert loaded.robot == constants
+    assert isinstance(loaded.robot["substeps"], int)
+    assert Manifest.model_validate_json(loaded.to_json(), strict=True) == loaded
+
+
 @pytest.mark.parametrize("name", ["manifest.json", "policy.onnx", "multiplier.onnx"])
 def test_a_missing_file_is_named(own_bundle: Path, name: str) -> None:
     (own_bundle / name).unlink()
@@ -98,6 +110,14 @@ def test_one_flipped_bit_is_noticed(own_bundle: Path, name: str) -> None:
         (lambda m: m["observation_layout"].pop(2), "block 'magnetometer'"),
         (lambda m: m["observation_layout"][1].update(name="accelerometer"), "block 'accelerometer'"),
         (lambda m: m.update(training={"lr": math.nan}), "training"),
+        (lambda m: m.update(robot={"mass": 0.0}), "robot.mass"),
+        (lambda m: m.update(robot={"mass": -0.005}), "robot.mass"),
+        (lambda m: m.update(robot={"mass": math.nan}), "robot.mass"),
+        (lambda m: m.update(robot={"mass": math.inf}), "robot.mass"),
+        (lambda m: m.update(robot={"mass": "0.005"}), "robot.mass"),
+        (lambda m: m.update(robot={"mass": True}), "robot.mass"),
+        (lambda m: m.update(robot=None), "robot"),
+        (lambda m: m.update(robot=[0.005]), "robot"),
         (lambda m: m["sha256"].pop("multiplier.onnx"), "sha256 of multiplier.onnx is missing"),
         (lambda m: m["sha256"].update({"policy.onnx": "abc"}), "sha256.policy.onnx"),
         (lambda m: m.update(opset=18), "opset ai.onnx 17, the manifest says ai.onnx 18"),

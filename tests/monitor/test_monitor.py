@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from filter import SAFE_ACTION, FilterError, FilterInputError, FilterMemory, Mode
+from decision import MEMORY, SAFE_ACTION, Mode, OpenedBy, Origin
+from filter import FilterConfig, FilterError, FilterInputError, Robot
 from models import Bundle, write_bundle
 from monitor import Monitor, MonitorError, NetworkError
 
@@ -35,6 +36,12 @@ def same_bits(a: np.ndarray, b: np.ndarray) -> bool:
     return a.tobytes() == b.tobytes()
 
 
+def written(bundle: Bundle, **changes: object) -> None:
+    """Writes a bundle anew with another manifest."""
+    fields = bundle.manifest.model_dump() | changes
+    write_bundle(bundle.path, bundle.policy, bundle.multiplier, type(bundle.manifest).model_validate(fields))
+
+
 @settings(max_examples=60, deadline=None)
 @given(observation=observations(), hazards=HAZARDS, gate=st.sampled_from(["risk", "always", "off"]))
 def test_what_holds_of_every_decision(monitors, observation, hazards, gate) -> None:
@@ -42,7 +49,14 @@ def test_what_holds_of_every_decision(monitors, observation, hazards, gate) -> N
     assert np.isfinite(decision.action).all()
     assert (np.abs(decision.action) <= 1.0).all()
     assert decision.risk >= 0.0
-    assert decision.gate_open == (gate == "always" or (gate == "risk" and decision.risk > decision.threshold))
+    if gate == "risk":
+        opened = decision.opened_by
+        assert (opened == OpenedBy.RISK) == (decision.risk > decision.threshold)
+        assert opened in (None, OpenedBy.RISK, OpenedBy.BARRIER)
+    else:
+        assert decision.opened_by == (OpenedBy.ALWAYS if gate == "always" else None)
+    assert decision.gate_open == (decision.opened_by is not None)
+    assert (decision.origin is None) == (decision.mode == "nominal")
     if decision.mode == "nominal":
         assert same_bits(decision.action, decision.nominal_action)
     if not decision.gate_open:
@@ -65,7 +79,7 @@ def test_a_batch_decides_as_its_robots_alone(monitors, rows, given_hazards, gate
         alone, together = monitors[gate].decide(row, None if hazards is None else hazards[i]), batch[i]
         assert same_bits(alone.action, together.action)
         assert alone.risk == pytest.approx(together.risk, rel=1e-6)
-        for name in ("mode", "barrier", "hazard", "row", "reason", "gate_open"):
+        for name in ("mode", "origin", "barrier", "hazard", "certified", "reason", "opened_by", "memory"):
             assert getattr(alone, name) == getattr(together, name)
 
 
@@ -84,7 +98,8 @@ def test_with_a_hazard_ahead_the_open_gate_changes_full_thrust_and_the_closed_on
     decision = build(fast, gate="always").decide(at_rest, [[0.45, 0.0]])
     assert decision.mode != "nominal"
     assert decision.hazard == 0
-    assert decision.row is not None
+    assert decision.origin is not None
+    assert not decision.certified
 
 
 @pytest.mark.parametrize("gate", ["risk", "always", "off"])
@@ -127,6 +142,9 @@ def test_networks_of_another_shape_end_in_the_fallback(build, at_rest, action, r
     [
         FilterError("broken"),
         FilterInputError("hazards", "broken"),
+        AttributeError("broken"),
+        TypeError("broken"),
+        AssertionError("broken"),
         RuntimeError("broken"),
         ValueError("broken"),
         ZeroDivisionError("broken"),
@@ -135,8 +153,9 @@ def test_networks_of_another_shape_end_in_the_fallback(build, at_rest, action, r
         np.linalg.LinAlgError("broken"),
     ],
 )
-def test_a_filter_that_raises_ends_in_the_fallback(build, at_rest, gate, fault) -> None:
-    decision = build(action_filter=build.filter(fault), gate=gate).decide(at_rest)
+@pytest.mark.parametrize("where", ["look", "decide"])
+def test_a_filter_that_raises_ends_in_the_fallback(build, at_rest, gate, fault, where) -> None:
+    decision = build(action_filter=build.filter(fault, where), gate=gate).decide(at_rest)
     assert decision.mode == "fallback"
     assert "broken" in str(decision.reason)
     assert tuple(decision.action) == SAFE_ACTION
@@ -145,13 +164,14 @@ def test_a_filter_that_raises_ends_in_the_fallback(build, at_rest, gate, fault) 
 @pytest.mark.parametrize(
     ("gate", "changes"),
     [
-        ("always", {"action": np.array([[np.nan, 0.0]]), "mode": np.array([1], np.int8)}),
-        ("always", {"action": np.array([[0.0, 1.5]]), "mode": np.array([1], np.int8)}),
+        ("always", {"action": np.array([[np.nan, 0.0]]), "mode": np.array(["filtered"])}),
+        ("always", {"action": np.array([[0.0, 1.5]]), "mode": np.array(["filtered"])}),
         ("always", {"action": np.zeros((1, 3))}),
         ("always", {"action": np.zeros((2, 2))}),
-        ("always", {"action": np.array([[0.01, 0.02]]), "mode": np.array([0], np.int8)}),
-        ("off", {"action": np.array([[0.01, 0.02]]), "mode": np.array([1], np.int8)}),
-        ("always", {"reason": None}),
+        ("always", {"action": np.array([[0.01, 0.02]]), "mode": np.array(["nominal"])}),
+        ("off", {"action": np.array([[0.01, 0.02]]), "mode": np.array(["filtered"])}),
+        ("off", {"action": np.array([[np.nan, 0.02]]), "mode": np.array(["filtered"])}),
+        ("always", {"mode": np.array(["nominal", "nominal"])}),
         ("always", {"action": None}),
     ],
 )
@@ -208,15 +228,45 @@ def test_hazards_of_another_kind_end_in_the_fallback(monitors, at_rest, bad) -> 
     assert decision.reason
 
 
-@pytest.mark.parametrize("bad", ["left", {}, FilterMemory.empty(0), FilterMemory.empty(2)])
+@pytest.mark.parametrize("bad", ["left", {}, 3, np.zeros(0, MEMORY), np.zeros(2, MEMORY), np.zeros(1)])
 def test_a_memory_of_another_robot_or_kind_is_a_fault_and_not_handed_back(monitors, at_rest, bad) -> None:
     decision = monitors["always"].decide(at_rest, memory=bad)
     assert decision.mode == "fallback"
-    assert decision.memory is not None
-    assert decision.memory.side.tolist() == [0]
+    assert decision.memory.tobytes() == np.zeros(1, MEMORY).tobytes()
     assert "memory" in str(decision.reason)
     with pytest.raises(ValueError, match="memory"):
         monitors["always"].decide_batch(np.tile(at_rest, (3, 1)), memory=bad)
+
+
+@pytest.mark.parametrize(
+    ("left", "plan"),
+    [(3, np.nan), (3, np.inf), (3, 1.5), (21, 0.05), (127, 0.05), (-1, 0.05)],
+)
+@pytest.mark.parametrize("fault", ["none", "observation", "networks"])
+def test_a_memory_that_no_filter_wrote_sends_nothing_wild(build, at_rest, left, plan, fault) -> None:
+    memory = np.zeros(1, MEMORY)
+    memory["left"], memory["plan"] = left, plan
+    if fault == "observation":
+        at_rest[0] = np.nan
+    networks = build.networks([[np.nan, 0.0]] if fault == "networks" else [[0.1, 0.1]])
+    monitor = build(networks)
+    for _ in range(3):
+        decision = monitor.decide(at_rest, memory=memory)
+        assert np.isfinite(decision.action).all()
+        assert (np.abs(decision.action) <= 1.0).all()
+        assert 0 <= decision.memory["left"] <= 20
+        memory = decision.memory
+
+
+def test_the_memory_of_a_decision_is_taken_as_it_is_given(build, hand) -> None:
+    # A row of an array, or an array of one: both are one robot's memory.
+    near = np.array([[0.305, 0.03]])
+    monitor = build(build.networks([[1.0, 0.0]]))
+    observation = hand.observe(near, (0.8, 0.0), 0.0, (2.0, 0.0))
+    memory = monitor.decide(observation, near).memory
+    memory["side"] = -30
+    after = [monitor.decide(observation, near, form) for form in (memory, np.array([memory]))]
+    assert after[0].memory.tobytes() == after[1].memory.tobytes()
 
 
 def test_hazards_of_another_number_of_robots_are_refused(monitors, at_rest) -> None:
@@ -228,35 +278,172 @@ def test_hazards_of_another_number_of_robots_are_refused(monitors, at_rest) -> N
 def test_the_filter_takes_the_bundles_hazard_radius(own_bundle: Path, at_rest) -> None:
     before = Monitor.load(own_bundle, "always").decide(at_rest, [[0.5, 0.0]]).barrier
     bundle = Bundle.load(own_bundle)
-    wider = bundle.manifest.model_copy(update={"hazard_radius": bundle.manifest.hazard_radius + 0.1})
-    write_bundle(own_bundle, bundle.policy, bundle.multiplier, wider)
-    after = Monitor.load(own_bundle, "always").decide(at_rest, [[0.5, 0.0]]).barrier
-    assert after == pytest.approx(before - 0.1)
+    radius = bundle.manifest.hazard_radius
+    written(bundle, hazard_radius=radius + 0.1)
+
+    def barrier(config: FilterConfig | None) -> float:
+        return Monitor.load(own_bundle, "always", filter_config=config).decide(at_rest, [[0.5, 0.0]]).barrier
+
+    assert barrier(None) == pytest.approx(before - 0.1)
+    # Settings about something else do not drop it.
+    assert barrier(FilterConfig()) == pytest.approx(before - 0.1)
+    assert barrier(FilterConfig(margin=0.03)) == pytest.approx(before - 0.12)
+    assert barrier(FilterConfig(hazard_radius=radius + 0.1)) == pytest.approx(before - 0.1)
+    assert barrier(FilterConfig(hazard_radius=radius + 0.15)) == pytest.approx(before - 0.15)
+    with pytest.raises(MonitorError, match="hazard_radius must be at least the bundle's"):
+        barrier(FilterConfig(hazard_radius=radius))
 
 
-def test_a_fault_forgets_what_the_filter_planned(monitors, at_rest) -> None:
-    memory = FilterMemory.empty(1)
-    memory.side[:] = 1
+def test_the_manifests_robot_reaches_the_filter(own_bundle: Path, hand) -> None:
+    # A robot of twice the mass coasts twice as far.
+    ahead = np.array([[0.9, 0.0]])
+    observation = hand.observe(ahead, (1.2, 0.0))
+    before = Monitor.load(own_bundle, "always").decide(observation, ahead)
+    bundle = Bundle.load(own_bundle)
+    written(bundle, robot={"mass": 2 * Robot().mass, "inertia": 2 * Robot().inertia})
+    heavy = Monitor.load(own_bundle, "always").decide(observation, ahead)
+    # Braking from 1.2 m/s takes twice the way.
+    assert heavy.barrier < before.barrier - 0.1
+    settled = Monitor.load(own_bundle, "always", filter_config=FilterConfig(robot=Robot()))
+    assert settled.decide(observation, ahead).barrier == pytest.approx(before.barrier)
+    # It reaches the guide as well, whose robot is the filter's.
+    monitor = Monitor.load(own_bundle, "always")
+    assert monitor._filter.guide._settings["robot"]["mass"][0] == pytest.approx(2 * Robot().mass)
+
+
+def test_a_robot_with_a_constant_that_is_none_is_refused(own_bundle: Path) -> None:
+    written(Bundle.load(own_bundle), robot={"mass": 0.005, "wheels": 4})
+    with pytest.raises(MonitorError, match="wheels"):
+        Monitor.load(own_bundle)
+
+
+def test_the_guides_strength_is_chosen_at_load(tiny_bundle: Path, hand) -> None:
+    at, goal = np.array([[0.6, 0.02]]), (2.2, 0.0)
+    observation, memory = hand.observe(at, (0.3, 0.0), 0.0, goal), np.zeros(1, MEMORY)
+    memory["guided"] = 1
+    modes = {
+        strength: Monitor.load(tiny_bundle, "always", guide=strength).decide(observation, at, memory).mode
+        for strength in ("off", "refusal", "ahead")
+    }
+    assert modes == {"off": "nominal", "refusal": "guided", "ahead": "guided"}
+    assert Monitor.load(tiny_bundle).decide_batch(observation[None], at[None], memory).mode[0] != "filtered"
+    with pytest.raises(MonitorError, match="guide must be one of"):
+        Monitor.load(tiny_bundle, guide="boldly")
+
+
+def test_a_fault_goes_on_with_the_plan_and_keeps_the_side(monitors, at_rest) -> None:
+    memory = np.zeros(1, MEMORY)
+    memory["side"], memory["guided"], memory["left"] = 9, 1, 2
+    memory["plan"][0, :2] = [(-0.05, 0.3), (-0.05, 0.0)]
     at_rest[0] = np.nan
-    after = monitors["always"].decide(at_rest, memory=memory).memory
-    assert after is not None
-    assert after.side.tolist() == [0]
+    for expected in ([-0.05, 0.3], [-0.05, 0.0], [0.0, 0.0], [0.0, 0.0]):
+        decision = monitors["always"].decide(at_rest, memory=memory)
+        assert decision.action.tolist() == expected
+        assert (decision.mode, decision.origin) == (Mode.FALLBACK, Origin.PLAN)
+        assert decision.opened_by == OpenedBy.FAULT
+        assert not decision.certified
+        assert np.isnan(decision.nominal_action).all()
+        assert np.isnan([decision.barrier, decision.risk]).all()
+        memory = decision.memory
+    assert memory["side"] == 9
 
 
-def test_no_hazards_given_means_none_are_there(monitors, at_rest) -> None:
-    at_rest[28] = 0.95  # the lidar sees one, which the given list overrules
-    assert monitors["always"].decide(at_rest, []).mode == "nominal"
+@pytest.mark.parametrize("gate", ["always", "risk"])
+def test_an_empty_list_of_hazards_overrules_no_sensor(build, hand, gate) -> None:
+    ahead = np.array([[0.4, 0.0]])
+    monitor = build(build.networks([[1.0, 0.0]]), gate=gate, threshold=1e9)
+    for known in ([], None, np.empty((0, 2)), [[0.0, 1.0]]):
+        decision = monitor.decide(hand.observe(np.vstack([ahead, [[0.0, 1.0]]]), (1.2, 0.0)), known)
+        assert decision.mode != "nominal"
+        assert decision.gate_open
+
+
+@pytest.mark.parametrize("bad", [[[np.nan, np.nan]], [[None, None]], [[0.4, 0.0], [np.nan, np.nan]]])
+def test_one_robots_hazards_that_are_no_numbers_are_refused(monitors, at_rest, bad) -> None:
+    # In a batch they stand for none; one robot's list is as long as it has hazards.
+    for monitor in monitors.values():
+        decision = monitor.decide(at_rest, bad)
+        assert decision.mode == "fallback"
+        assert "hazards must be finite" in str(decision.reason)
+
+
+def test_in_a_batch_a_row_of_nan_is_no_hazard(monitors, at_rest) -> None:
+    hazards = np.full((2, 2, 2), np.nan)
+    hazards[0, 0] = (0.5, 0.0)
+    batch = monitors["always"].decide_batch(np.tile(at_rest, (2, 1)), hazards)
+    assert batch.mode.tolist() == ["nominal", "nominal"]
+    assert batch.barrier[0] < batch.barrier[1] == 3.0
+
+
+@pytest.mark.parametrize(
+    ("action", "sound"),
+    [([1.0 + 5e-7, 0.0], True), ([1.0 + 2e-6, 0.0], False), ([0.0, -1.5], False), ([np.inf, 0.0], False)],
+)
+def test_a_nominal_action_beyond_its_bounds_is_a_fault_and_never_clipped_in_silence(
+    build, at_rest, action, sound
+) -> None:
+    for gate in ("always", "off", "risk"):
+        monitor = build(build.networks([action]), gate=gate)
+        decision = monitor.decide(at_rest)
+        assert (decision.mode == "nominal") == sound
+        assert (monitor.faults.counts["networks"] == 0) == sound
+        if not sound:
+            assert decision.opened_by == OpenedBy.FAULT
+            np.testing.assert_array_equal(decision.nominal_action, action)
+
+
+def test_bounds_of_the_manifest_that_are_tighter_hold(own_bundle: Path, build, at_rest) -> None:
+    written(Bundle.load(own_bundle), action_low=[-0.5, -0.5], action_high=[0.5, 0.5])
+    bundle = Bundle.load(own_bundle)
+    monitor = Monitor(bundle, build.networks([[0.7, 0.0]]), build.filter(), "off")
+    assert monitor.decide(at_rest).mode == "fallback"
 
 
 def test_one_bad_row_falls_back_alone(monitors, at_rest) -> None:
     rows = np.tile(at_rest, (4, 1))
     rows[2, 5] = np.nan
-    batch = monitors["always"].decide_batch(rows, memory=FilterMemory.empty(4))
+    batch = monitors["always"].decide_batch(rows, memory=np.zeros(4, MEMORY))
     assert batch.mode.tolist() == [Mode.NOMINAL, Mode.NOMINAL, Mode.FALLBACK, Mode.NOMINAL]
-    assert batch[2].reason == "observation[5] is nan"
+    assert "observation[5]" in str(batch[2].reason)
+    assert batch.opened_by.tolist() == ["always", "always", "fault", "always"]
     assert same_bits(batch[0].action, monitors["always"].decide(at_rest).action)
-    assert batch.memory is not None
-    assert len(batch.memory.side) == 4
+    assert batch.memory.shape == (4,)
+
+
+@pytest.mark.parametrize("where", ["look", "decide", "networks"])
+@pytest.mark.parametrize("spoilt", [[1], [0, 3], [0, 1, 2, 3, 4]])
+def test_a_fault_in_some_rows_leaves_the_others_alone(build, hand, where, spoilt) -> None:
+    near = np.array([[0.305, 0.03]])
+    rows = np.tile(hand.observe(near, (0.8, 0.0)), (5, 1))
+    rows[:, 5] = np.arange(5) * 1e-3
+    memory = np.zeros(5, MEMORY)
+    memory["left"], memory["plan"][:, 0] = 1, (-0.03, 0.1)
+    networks, broken = build.networks([[1.0, 0.0]]), build.filter(AttributeError("broken"), where)
+    broken.spoilt = 0.79
+    sound = build(networks, build.filter()).decide_batch(rows, None, memory)
+    if where == "networks":
+
+        def failing(observation):
+            if (observation[:, 3] == 0.79).any():
+                raise AttributeError("broken")
+            return [[1.0, 0.0]]
+
+        networks, broken = build.networks(failing), build.filter()
+    rows[spoilt, 3] = 0.79
+    monitor = build(networks, broken)
+    batch = monitor.decide_batch(rows, None, memory)
+    for k in range(5):
+        if k in spoilt:
+            assert batch[k].reason == "broken"
+            assert batch.action[k].tolist() == [-0.03, 0.1]
+            assert batch[k].opened_by == OpenedBy.FAULT
+        else:
+            assert batch[k].origin == sound[k].origin
+            assert sound[k].mode == Mode.FILTERED
+            assert same_bits(batch.action[k], sound.action[k])
+            assert batch.memory[k].tobytes() == sound.memory[k].tobytes()
+    assert monitor.faults.counts["AttributeError"] == len(spoilt)
+    assert monitor.faults.internal() == len(spoilt)
 
 
 def test_a_batch_of_none_and_one_of_another_rank(monitors, at_rest) -> None:

@@ -1,10 +1,13 @@
 import numpy as np
-from filter.lidar import CONES, decode, decode_goal, likeliest
-from filter.obstacles import COLUMNS, gap
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from system.lidar import CONES, decode, decode_goal, likeliest, unexplained
+from system.obstacles import COLUMNS, gap
+
 RADIUS = 0.2
+ALL = np.ones(16, dtype=bool)
+NONE = np.empty((0, 2))
 bearings = st.one_of(
     st.floats(-np.pi, np.pi),
     st.integers(0, 16).map(lambda b: b * np.pi / 8),
@@ -29,7 +32,7 @@ crowds = st.tuples(st.floats(0.2, 2.5), st.floats(-np.pi, np.pi)).flatmap(
 def obstacles(readings, reach=1.6, spread=0.0):
     out = np.zeros((CONES, COLUMNS))
     source = np.zeros(CONES, dtype=np.int64)
-    count = decode(readings, reach, RADIUS, spread, out, source)
+    count = decode(readings, ALL, reach, RADIUS, spread, out, source, 0, 0)
     return out[:count], source[:count]
 
 
@@ -67,7 +70,7 @@ def test_a_hazard_alone_is_decoded_exactly(hand, distance, bearing):
     # Nothing is in the way on the far side.
     assert min(gap(cones, i, -0.4 * np.cos(bearing), -0.4 * np.sin(bearing)) for i in range(len(cones))) > 0.3
     guess, labels = np.zeros((16, 3)), np.zeros(16, dtype=np.int64)
-    assert likeliest(hand.scan(at), 0.3, guess, labels) >= 1
+    assert likeliest(hand.scan(at), ALL, 0.3, guess, labels, 0, 0) >= 1
     assert np.linalg.norm(guess[:3, :2] - at, axis=1).min() < 1e-6
     assert set(source) <= {(int(np.remainder(bearing, 2 * np.pi) * 8 / np.pi) + i) % 16 for i in (-1, 0, 1)}
 
@@ -84,3 +87,58 @@ def test_goal_is_exact(hand, distance, bearing):
     seen, x, y = decode_goal(hand.scan(np.array([at])))
     assert seen
     np.testing.assert_allclose((x, y), at, atol=1e-6)
+
+
+@settings(deadline=None, max_examples=100)
+@given(hazards=st.one_of(st.lists(places, min_size=1, max_size=10), crowds))
+def test_the_given_hazards_account_for_their_own_scan(hand, hazards):
+    at = np.array(hazards)
+    assert not unexplained(hand.scan(at), at, 0.0, 0.0).any()
+    absent = np.vstack([np.full((1, 2), np.nan), at])
+    assert not unexplained(hand.scan(at), absent, 0.0, 0.0).any()
+
+
+@settings(deadline=None, max_examples=100)
+@given(
+    hazards=st.lists(places, min_size=1, max_size=6),
+    off=st.floats(-0.02, 0.02),
+    turned=st.floats(-0.03, 0.03),
+)
+def test_within_the_bounds_of_the_errors_given_hazards_still_account_for_it(hand, hazards, off, turned):
+    assume(all(np.hypot(*place) > 0.05 for place in hazards))
+    polar = [(np.hypot(x, y) + off, np.arctan2(y, x) + turned) for x, y in hazards]
+    measured = np.array([(max(d, 0.0) * np.cos(b), max(d, 0.0) * np.sin(b)) for d, b in polar])
+    assert not unexplained(hand.scan(np.array(hazards)), measured, 0.02, 0.03).any()
+
+
+@settings(deadline=None, max_examples=100)
+@given(
+    known=st.lists(places, max_size=6),
+    distance=st.floats(0.05, 1.4),
+    bearing=st.floats(-np.pi, np.pi),
+)
+def test_a_hazard_that_is_not_given_is_covered_unless_a_given_one_hides_it(hand, known, distance, bearing):
+    extra = np.array([[distance * np.cos(bearing), distance * np.sin(bearing)]])
+    at = np.array(known).reshape(-1, 2)
+    readings = hand.scan(np.vstack([at, extra]))
+    wanted = unexplained(readings, at, 0.0, 0.0)
+    own = int(np.remainder(bearing, 2 * np.pi) * 8 / np.pi) % 16
+    if not wanted[own]:
+        # It is behind one that is given: the scan would be the same without it.
+        assert hand.scan(at)[own] >= hand.scan(extra)[own] - 1e-3
+        return
+    out, source = np.zeros((CONES, COLUMNS)), np.zeros(CONES, dtype=np.int64)
+    count = decode(readings, wanted, 1.6, RADIUS, 0.0, out, source, 0, len(at))
+    assert min(gap(out, i, *extra[0]) for i in range(count)) <= -RADIUS + 1e-6
+    assert (source[:count] >= len(at)).all()
+
+
+def test_what_was_there_already_stays_in_front(hand):
+    readings = hand.scan(np.array([[0.6, 0.1]]))
+    out, source = np.full((CONES + 2, COLUMNS), 7.0), np.full(CONES + 2, -5)
+    count = decode(readings, ALL, 1.6, RADIUS, 0.0, out, source, 2, 100)
+    assert count > 2
+    assert (out[:2] == 7.0).all()
+    assert source[:2].tolist() == [-5, -5]
+    assert (source[2:count] >= 100).all()
+    assert decode(readings, ~ALL, 1.6, RADIUS, 0.0, out, source, 2, 100) == 2

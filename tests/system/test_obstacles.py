@@ -1,7 +1,8 @@
 import numpy as np
-from filter.obstacles import FAR, gap, gap_segment, least_gap
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+
+from system.obstacles import FAR, gap, gap_segment, least_gap
 
 places = st.floats(-2.0, 2.0)
 cones = st.tuples(places, places, places, places, st.floats(0.05, 0.4), st.floats(-0.04, 0.6))

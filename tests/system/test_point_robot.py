@@ -1,12 +1,10 @@
 import numpy as np
 import pytest
-from filter.backups import BACKUPS, STEPS, TURN, law
-from filter.robot import Robot, State, advance, follow, stopping
-from hypothesis import assume, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from filter.config import MODEL_ERROR, FilterConfig
-from filter.config import settings as make_settings
+from system.point_robot import ROBOT as RECORD
+from system.point_robot import Robot, State, advance, follow, stopping
 
 ROBOT = Robot()
 speeds = st.floats(-1.5, 1.5)
@@ -61,42 +59,6 @@ def test_servo_that_holds_a_heading_gives_in_to_the_drag(hand):
     assert reduced.heading == pytest.approx(state[2], abs=0.0015)
 
 
-@settings(deadline=None, max_examples=400)
-@given(
-    state=states,
-    action=st.tuples(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0)),
-    kind=st.integers(0, BACKUPS - 1),
-    steps=st.integers(0, STEPS),
-)
-def test_a_followed_plan_stays_near_the_path_that_was_certified(hand, state, action, kind, steps):
-    # Turned to face sideways to the motion, the axis may be turned into it either way round.
-    numbers = make_settings(FilterConfig())
-    u1, u2 = action[0] * ROBOT.force_limit, action[1]
-    middle = advance(ROBOT, state, u1, u2, ROBOT.substeps // 2)
-    after = advance(ROBOT, middle, u1, u2, ROBOT.substeps // 2)
-    at = stopping(ROBOT, after)
-    across = abs((at.zx - at.x) * np.cos(at.heading) + (at.zy - at.y) * np.sin(at.heading))
-    assume(kind != TURN or across > 0.01)
-    path = [(0.0, 0.0), (middle.x, middle.y), (after.x, after.y)]
-    for _ in range(steps):
-        at = follow(ROBOT, at, *law(numbers, kind, at))
-        path.append((at.x, at.y))
-    path.append((at.zx, at.zy))
-    real = np.array(hand.step_exactly(np.array(state), np.array([u1, u2])))
-    for step in range(steps + 60):
-        assert distance_to_path(real[:2], np.array(path)) < MODEL_ERROR
-        share, turn = law(numbers, kind, stopping(ROBOT, State(*real))) if step < steps else (0.0, 0.0)
-        real = hand.step_exactly(real, np.array([share * ROBOT.force_limit, turn]))
-
-
-def distance_to_path(point, path):
-    """Distance of a point (2,) from a polyline (n, 2)."""
-    start, way = path[:-1], np.diff(path, axis=0)
-    length = np.maximum((way**2).sum(axis=1), 1e-18)
-    share = np.clip(((point - start) * way).sum(axis=1) / length, 0.0, 1.0)
-    return np.linalg.norm(start + share[:, None] * way - point, axis=1).min()
-
-
 def test_published_figures():
     assert ROBOT.time_constant == pytest.approx(0.519, abs=1e-3)
     assert ROBOT.stop_speed == pytest.approx(1.5)
@@ -107,3 +69,11 @@ def test_published_figures():
     while at.zx > at.x:
         at = follow(ROBOT, at, -1.0, 0.0)
     assert at.x == pytest.approx(0.24, abs=5e-3)
+
+
+def test_the_record_of_compiled_code_has_every_constant():
+    record = np.zeros(1, RECORD)
+    record[0] = tuple(ROBOT)
+    assert RECORD.names == Robot._fields
+    assert [record[name][0] for name in RECORD.names] == list(ROBOT)
+    assert ROBOT.control_step == pytest.approx(0.02)

@@ -1,0 +1,101 @@
+"""The memory over JSON and as a plan: the same afterwards, and nothing but what was written is taken."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from decision import MEMORY, PLAN_STEPS, memory_from_json, memory_to_json, next_of_plan
+
+controls = st.floats(-1.0, 1.0)
+
+
+@st.composite
+def memories(draw: st.DrawFn) -> np.ndarray:
+    """Memories (1,) that a filter can leave."""
+    memory = np.zeros(1, MEMORY)
+    plan = draw(st.lists(st.tuples(controls, controls), max_size=PLAN_STEPS))
+    memory["side"], memory["guided"] = draw(st.integers(-127, 127)), draw(st.integers(-1, 1))
+    memory["left"] = len(plan)
+    memory["plan"][0, : len(plan)] = np.array(plan).reshape(-1, 2)
+    return memory
+
+
+@given(memory=memories())
+def test_it_survives_json(memory) -> None:
+    again = memory_from_json(json.loads(json.dumps(memory_to_json(memory[0]), allow_nan=False)))
+    assert again.dtype == MEMORY
+    assert again.tobytes() == memory.tobytes()
+
+
+def good() -> dict:
+    memory = np.zeros(1, MEMORY)
+    memory["left"] = 2
+    memory["plan"][0, :2] = 0.05
+    return memory_to_json(memory[0])
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (lambda m: m.clear(), "memory has the fields"),
+        (lambda m: m.update(extra=[0]), "extra"),
+        (lambda m: m.pop("side"), "expected guided, plan, side"),
+        (lambda m: m.update(side=[]), r"memory\.side"),
+        (lambda m: m.update(side=0.5), r"memory\.side"),
+        (lambda m: m.update(side=1e300), r"memory\.side"),
+        (lambda m: m.update(side=128), r"memory\.side"),
+        (lambda m: m.update(side=-128), r"memory\.side"),
+        (lambda m: m.update(side=True), r"memory\.side"),
+        (lambda m: m.update(side="left"), r"memory\.side"),
+        (lambda m: m.update(side=None), r"memory\.side"),
+        (lambda m: m.update(guided=-2), r"memory\.guided"),
+        (lambda m: m.update(guided=2), r"memory\.guided"),
+        (lambda m: m.update(guided=None), r"memory\.guided"),
+        (lambda m: m.update(plan=None), r"memory\.plan"),
+        (lambda m: m.update(plan="fast"), r"memory\.plan"),
+        (lambda m: m.update(plan=[1.0]), r"memory\.plan"),
+        (lambda m: m.update(plan=[[1.0, 0.0, 0.0]]), r"memory\.plan"),
+        (lambda m: m.update(plan=[[1.5, 0.0]]), r"memory\.plan"),
+        (lambda m: m.update(plan=[[float("nan"), 0.0]]), r"memory\.plan"),
+        (lambda m: m.update(plan=[[None, 0.0]]), r"memory\.plan"),
+        (lambda m: m.update(plan=[[1.0, 0.0]] * (PLAN_STEPS + 1)), r"memory\.plan"),
+        (lambda m: m.update(plan={}), r"memory\.plan"),
+        # No list of pairs, though as many numbers.
+        (lambda m: m.update(plan=[1.0, 0.0]), r"memory\.plan"),
+        (lambda m: m.update(plan=[[1.0, 0.0, 0.5, 0.5]]), r"memory\.plan"),
+        (lambda m: m.update(plan=[[True, False]]), r"memory\.plan"),
+        (lambda m: m.update(plan=[["0.5", "0.5"]]), r"memory\.plan"),
+    ],
+)
+def test_what_this_version_did_not_write_is_refused_and_its_field_named(change, named) -> None:
+    value = good()
+    change(value)
+    with pytest.raises(ValueError, match=named):
+        memory_from_json(value)
+
+
+@given(memory=memories(), more=st.integers(1, 4))
+def test_the_plan_is_played_action_by_action_and_then_the_robot_coasts(memory, more) -> None:
+    before, plan = memory.copy(), memory["plan"][0, : memory["left"][0]].copy()
+    after = memory
+    for k in range(len(plan) + more):
+        action, after = next_of_plan(after)
+        np.testing.assert_array_equal(action, plan[k : k + 1] if k < len(plan) else [[0.0, 0.0]])
+        assert after["left"][0] == max(len(plan) - k - 1, 0)
+        assert (after["side"] == before["side"]).all()
+        assert (after["guided"] == before["guided"]).all()
+    assert memory.tobytes() == before.tobytes()  # nothing of the caller's is changed
+
+
+def test_each_robot_plays_its_own_plan() -> None:
+    memory = np.zeros(3, MEMORY)
+    memory["left"] = [0, 1, 20]
+    memory["plan"] = 0.03
+    action, after = next_of_plan(memory)
+    np.testing.assert_array_equal(action, [[0.0, 0.0], [0.03, 0.03], [0.03, 0.03]])
+    assert after["left"].tolist() == [0, 0, 19]
