@@ -12,7 +12,8 @@ PLAN_STEPS = 20
 """Control steps for which a plan thrusts at most: 0.4 s; a full brake from top speed takes 0.36 s."""
 
 MEMORY = np.dtype(
-    [("side", "i1"), ("guided", "i1"), ("planned", "?"), ("left", "i1"), ("plan", "f8", (PLAN_STEPS, 2))]
+    [("plan", "f8", (PLAN_STEPS, 2)), ("side", "i4"), ("left", "i2"), ("guided", "i1"), ("planned", "?")],
+    align=True,
 )
 """One robot's memory; zeros before its first step.
 
@@ -29,12 +30,17 @@ Memory = NDArray[np.void]
 
 
 def next_of_plan(memory: Memory) -> tuple[NDArray[np.float64], Memory]:
-    """The plans' next actions (N, 2), coasting where a plan has ended, and the memory without them."""
-    action = np.where((memory["left"] > 0)[:, None], memory["plan"][:, 0], 0.0)
+    """The plans' next actions (N, 2), coasting where a plan has ended, and the memory without them.
+
+    A memory that no filter wrote moves nothing: an action that is none ends its plan.
+    """
+    action = memory["plan"][:, 0]
+    going = (memory["left"] > 0) & (np.abs(action) <= 1.0).all(axis=1)
+    action = np.where(going[:, None], action, 0.0)
     after = memory.copy()
     after["plan"][:, :-1] = memory["plan"][:, 1:]
     after["plan"][:, -1] = 0.0
-    after["left"] = np.maximum(memory["left"] - 1, 0)
+    after["left"] = np.where(going, np.minimum(memory["left"], PLAN_STEPS) - 1, 0)
     return action, after
 
 
@@ -64,12 +70,19 @@ def memory_from_json(value: Mapping[str, Any]) -> Memory:
         memory[name] = number
     if value["plan"] is None:
         return memory
-    try:
-        plan = np.asarray(value["plan"], dtype=np.float64).reshape(-1, 2)
-    except (TypeError, ValueError) as error:
-        raise ValueError("memory.plan must be a list of pairs of numbers") from error
-    if len(plan) > PLAN_STEPS or not (np.abs(plan) <= 1.0).all():
-        raise ValueError(f"memory.plan must hold at most {PLAN_STEPS} pairs of numbers in -1..1")
+    plan = value["plan"]
+    if not isinstance(plan, list) or len(plan) > PLAN_STEPS or not all(map(_is_action, plan)):
+        raise ValueError(f"memory.plan must be a list of at most {PLAN_STEPS} pairs of numbers in -1..1")
     memory["planned"], memory["left"] = True, len(plan)
-    memory["plan"][0, : len(plan)] = plan
+    for step, action in enumerate(plan):
+        memory["plan"][0, step] = action
     return memory
+
+
+def _is_action(pair: object) -> bool:
+    """Whether something is a list of two numbers in -1..1."""
+    return (
+        isinstance(pair, list)
+        and len(pair) == 2
+        and all(type(number) in (int, float) and abs(number) <= 1.0 for number in pair)
+    )

@@ -8,6 +8,7 @@ All take ``settings`` (1,) of `SETTINGS` and arrays with a row for each of N rob
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -135,15 +136,12 @@ def screen(
     active: BoolArray,
     certificates: Records,
     certified: BoolArray,
-    side: NDArray[np.int8],
-    planned: BoolArray,
-    left: NDArray[np.int8],
-    plan: FloatArray,
+    memory: Records,
 ) -> int:
     """Look for certificates of the nominal actions (N, 2) where the gate is open; how many have none.
 
     Where ``active`` (N,) is False, the sure backup stands for one. ``certified`` (N,) receives which have
-    one; a remembered ``side`` (N,) fades; the last three (N,), (N,), (N, PLAN_STEPS, 2) receive the plans.
+    one; in ``memory`` (N,) a remembered side fades, and the plans are written down.
     """
     config = settings[0]
     refused = 0
@@ -154,24 +152,25 @@ def screen(
         if active[k]:
             found = certify_one(config, obstacles[k], seen[k].count, state, u1, u2, config.hysteresis)
             one.clearance, one.nearest, one.backup, one.steps = found
-            certified[k] = planned[k] = found[0] >= config.hysteresis
+            certified[k] = found[0] >= config.hysteresis
             refused += not certified[k]
         else:
             sure = seen[k].sure
             one.clearance, one.nearest = sure.clearance, sure.nearest
             one.backup, one.steps = sure.backup, sure.steps
-            planned[k] = sure.clearance >= 0.0
-        side[k] -= (side[k] > 0) - (side[k] < 0)
-        left[k] = _plan(config, state, u1, u2, one.backup, one.steps, plan[k])
+        past = memory[k]
+        past.side -= (past.side > 0) - (past.side < 0)
+        past.planned = certified[k] or (not active[k] and one.clearance >= 0.0)
+        _plan(config, state, u1, u2, one.backup, one.steps, past)
     return refused
 
 
 @compiled
-def _plan(
-    config: Settings, state: State, u1: float, u2: float, backup: int, steps: int, plan: FloatArray
-) -> int:
-    """Write down, action by action, a backup from where an action leads; how many actions it has."""
+def _plan(config: Settings, state: State, u1: float, u2: float, backup: int, steps: int, memory: Any) -> None:
+    """Write down, action by action, a backup from where an action leads."""
+    plan = memory.plan
     plan[:] = 0.0
+    memory.left = steps
     if steps > 0:
         robot = config.robot
         at = stopping(robot, advance(robot, state, u1, u2, robot.substeps))
@@ -180,7 +179,6 @@ def _plan(
             at = follow(robot, at, thrust, turn)
             plan[step, 0] = thrust * robot.force_limit
             plan[step, 1] = turn
-    return steps
 
 
 @entry
@@ -361,14 +359,10 @@ def keep_plans(
     rows: IntArray,
     action: FloatArray,
     certificates: Records,
-    left: NDArray[np.int8],
-    plan: FloatArray,
+    memory: Records,
 ) -> None:
-    """Write down the backups of the certificates, from where ``action`` (N, 2) leads.
-
-    ``left`` (N,) receives how many actions each has, ``plan`` (N, PLAN_STEPS, 2) the actions.
-    """
+    """Write the backups of the certificates, from where ``action`` (N, 2) leads, to ``memory`` (N,)."""
     for k in rows:
-        one = certificates[k]
-        u1, u2 = action[k]
-        left[k] = _plan(settings[0], _state(seen[k]), u1, u2, one.backup, one.steps, plan[k])
+        one, past = certificates[k], memory[k]
+        past.planned = True
+        _plan(settings[0], _state(seen[k]), action[k, 0], action[k, 1], one.backup, one.steps, past)

@@ -173,7 +173,7 @@ class KeptOSQP:
         lower[size:] = -1.0
         workspace = self._workspace(size, problem.weights)
         workspace.update(q=-problem.weights * problem.reference, l=lower, u=upper, Ax=A.T.ravel())
-        result = workspace.solve()
+        result = workspace.solve(raise_error=False)
         if result.info.status_val in (
             osqp.SolverStatus.OSQP_SOLVED,
             osqp.SolverStatus.OSQP_SOLVED_INACCURATE,

@@ -65,10 +65,7 @@ class Step:
             active,
             self.certificates,
             self.certified,
-            self.memory["side"],
-            self.memory["planned"],
-            self.memory["left"],
-            self.memory["plan"],
+            self.memory,
         )
 
     @cached_property
@@ -191,11 +188,7 @@ class Step:
             opened_by = np.where(self.active, opened_by, texts("", n))
         if self._open is not None:
             rows = np.flatnonzero(self._open)
-            memory["planned"][rows] = True
-            left, plan = memory["left"], memory["plan"]
-            kernel.keep_plans(
-                self.settings, self.scene.seen, rows, self.action, self.certificates, left, plan
-            )
+            kernel.keep_plans(self.settings, self.scene.seen, rows, self.action, self.certificates, memory)
         return Decisions(
             action=self.action,
             nominal_action=self.nominal,

@@ -115,7 +115,7 @@ class Guide:
             step.active,
             step.certified,
             ahead,
-            memory["guided"],
+            memory,
             proposed,
             leads,
             hazard,
@@ -184,7 +184,7 @@ def lead(
     active: NDArray[np.bool_],
     certified: NDArray[np.bool_],
     ahead: bool,
-    guided: NDArray[np.int8],
+    memory: Records,
     proposed: FloatArray,
     leads: NDArray[np.bool_],
     hazard: IntArray,
@@ -200,7 +200,7 @@ def lead(
         active: (N,) who may be led.
         certified: (N,) whose nominal action has a certificate.
         ahead: whether to lead whoever has something in the way, refused or not.
-        guided: (N,) the side on which a robot is being led past something, 0 for none, overwritten.
+        memory: (N,) of `MEMORY`: the side on which a robot is being led past something is overwritten.
         proposed: (N, 2) the nominal actions u1, u2; overwritten where it leads.
         leads: (N,) receives whether it leads.
         hazard: (N,) receives the hazard, or n + the bin, that is in the way; -1 for none.
@@ -210,17 +210,18 @@ def lead(
     size = given.shape[1] + LIDAR_BINS
     discs, source = np.empty((size, 3)), np.empty(size, dtype=np.int64)
     for k in range(len(seen)):
-        if not (active[k] and (ahead or guided[k] != 0 or not certified[k])):
-            guided[k] = 0
+        past = memory[k]
+        if not (active[k] and (ahead or past.guided != 0 or not certified[k])):
+            past.guided = 0
             continue
         state = State(0.0, 0.0, 0.0, seen[k].vx, seen[k].vy, seen[k].yaw_rate)
         count = _discs(config, given[k], observation[k, first:last], discs, source)
         at = decode_goal(observation[k, goal : goal + LIDAR_BINS])
-        engaged = ahead or guided[k] != 0
+        engaged = ahead or past.guided != 0
         leads[k], led, way = _leads(
-            config, discs, count, at, state, proposed[k], not certified[k], engaged, guided[k]
+            config, discs, count, at, state, proposed[k], not certified[k], engaged, past.guided
         )
-        guided[k] = way.side if led else 0
+        past.guided = way.side if led else 0
         hazard[k] = source[way.blocker] if way.blocker >= 0 else -1
         if leads[k]:
             thrust, turn = steer(config, discs, count, state, way.x, way.y)

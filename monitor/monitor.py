@@ -138,15 +138,19 @@ class Monitor:
         Returns:
             The decision; a bad input or any fault inside gives mode "fallback" with the reason.
         """
-        past = np.zeros(1, MEMORY)
+        past, lost = np.zeros(1, MEMORY), None
         try:
             past = _memory_of(1, memory)
+        except ValueError as error:
+            self.faults.note("bad input", str(error))
+            lost = f"bad input: {error}"
+        try:
             row = np.array(observation, dtype=np.float64)[None]
             given = None if hazards is None else _one_robots_hazards(hazards)
         except (TypeError, ValueError) as error:
             self.faults.note("bad input", str(error))
             return self._fall_back(past, f"bad input: {error}")[0]
-        return self._decide_or_fall_back(row, given, past)[0]
+        return self._decide_or_fall_back(row, given, past, lost)[0]
 
     def decide_batch(
         self, observation: ArrayLike, hazards: ArrayLike | None = None, memory: Memory | None = None
@@ -175,10 +179,11 @@ class Monitor:
         return self._decide_or_fall_back(rows, given, _memory_of(len(rows), memory))
 
     def _decide_or_fall_back(
-        self, observation: FloatArray, hazards: FloatArray | None, memory: Memory
+        self, observation: FloatArray, hazards: FloatArray | None, memory: Memory, lost: str | None = None
     ) -> Decisions:
+        """Decides; ``lost`` says that the memory was lost, and why: then nothing nominal is sent."""
         try:
-            return self._decide(observation, hazards, memory)
+            return self._decide(observation, hazards, memory, lost)
         except Exception as error:  # noqa: BLE001 - whatever it is, the robot needs an action
             if len(observation) <= 1:
                 return self._fall_back(memory, self._note(error))
@@ -192,7 +197,9 @@ class Monitor:
             ]
         )
 
-    def _decide(self, observation: FloatArray, hazards: FloatArray | None, memory: Memory) -> Decisions:
+    def _decide(
+        self, observation: FloatArray, hazards: FloatArray | None, memory: Memory, lost: str | None
+    ) -> Decisions:
         """Networks, gate, filter; raises on whatever cannot be told apart by robot."""
         size = self._networks.observation_size
         if observation.shape[1:] != (size,):
@@ -202,32 +209,40 @@ class Monitor:
         if nominal.shape != (len(observation), 2) or risk.shape != nominal.shape[:1]:
             raise NetworkError(f"the networks gave shapes {nominal.shape} and {risk.shape}")
         sound = np.empty(len(risk), np.bool_)
-        all_sound = within(nominal, self._low, self._high, risk, sound)
+        all_sound = within(nominal, self._low, self._high, risk, sound) and lost is None
         opened_by = self.gate.opened_by(risk, scene.low)
         asked = nominal
         if not all_sound:
+            sound &= lost is None
             opened_by = np.where(sound, opened_by, texts(OpenedBy.FAULT, len(sound)))
-            planned, memory = next_of_plan(memory)
-            asked = np.where(sound[:, None], nominal, planned)
+            planned, after = next_of_plan(memory)
+            asked, memory = np.where(sound[:, None], nominal, planned), np.where(sound, memory, after)
         active = opened_by != ""
         decided = self._filter.decide(scene, asked, memory, active)
-        if decided.action is not asked:
+        if decided.action is not asked or decided.mode.shape != active.shape:
             self._check_decided(decided, asked, active)
         if not all_sound:
-            decided = self._without_networks(decided, nominal, risk, ~sound)
+            decided = self._planned(decided, nominal, risk, ~sound, lost)
         return decided.told(nominal, risk, self.gate.threshold, opened_by)
 
-    def _without_networks(
-        self, decided: Decisions, nominal: FloatArray, risk: FloatArray, rows: NDArray[np.bool_]
+    def _planned(
+        self,
+        decided: Decisions,
+        nominal: FloatArray,
+        risk: FloatArray,
+        rows: NDArray[np.bool_],
+        lost: str | None,
     ) -> Decisions:
-        """Says of some rows that their plan was asked for in place of a policy's action."""
+        """Says of some rows that their plan was asked for in place of a policy's action, and why."""
         reason = list(decided.reason)
         for i in np.flatnonzero(rows):
-            reason[i] = f"the networks gave action {nominal[i].tolist()} and multiplier {risk[i]}"
-            self.faults.note("networks", str(reason[i]))
+            reason[i] = lost
+            if lost is None:
+                reason[i] = f"the networks gave action {nominal[i].tolist()} and multiplier {risk[i]}"
+                self.faults.note("networks", str(reason[i]))
         return replace(
             decided,
-            mode=np.where(rows, Mode.FALLBACK, decided.mode),
+            mode=np.where(rows, texts(Mode.FALLBACK, len(rows)), decided.mode),
             origin=np.where(rows & (decided.mode == Mode.NOMINAL), Origin.PLAN, decided.origin),
             reason=reason,
         )

@@ -147,7 +147,7 @@ def test_a_plan_that_was_left_is_forgotten(robot_filter, hand):
     hazards = np.array([[0.35, 0.0]])
     observation = hand.observe(hazards, (1.4, 0.0))[None]
     old = np.zeros(1, MEMORY)
-    old["left"] = 7
+    old["planned"], old["left"] = True, 7
     old["plan"][0, :7] = (0.05, 0.0)
     # A hazard that is given is certain: what was planned did not reckon with it.
     blank = hand.observe(np.empty((0, 2)), (1.4, 0.0))[None]
