@@ -13,7 +13,9 @@ from system.point_robot import State, advance, stopping
 
 FloatArray = NDArray[np.float64]
 
-CERTIFICATE = np.dtype([("clearance", "f8"), ("nearest", "i8"), ("backup", "i8"), ("steps", "i8")])
+CERTIFICATE = np.dtype(
+    [("clearance", "f8"), ("nearest", "i8"), ("backup", "i8"), ("steps", "i8")], align=True
+)
 """What a certificate says: the clearance [m], at or above 0 if there is one; the obstacle that bounds it, -1
 if none; the backup that it ends in, and for how many control steps that one thrusts."""
 

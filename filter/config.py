@@ -89,7 +89,7 @@ _NUMBERS = (
     "pursuit",
     "slow",
 )
-SETTINGS = np.dtype([("robot", ROBOT), *((name, "f8") for name in _NUMBERS)])
+SETTINGS = np.dtype([("robot", ROBOT), *((name, "f8") for name in _NUMBERS)], align=True)
 """`FilterConfig`'s numbers as compiled code takes them: ``margin`` holds the position error as well, ``sure``
 is what is kept whatever happens. An array of one: numba passes it fifty times as fast as a tuple."""
 

@@ -41,7 +41,8 @@ SEEN = np.dtype(
         ("count", "i8"),
         ("now", CERTIFICATE),
         ("sure", CERTIFICATE),
-    ]
+    ],
+    align=True,
 )
 """One robot as the filter sees it: its velocity ahead and to the left [m/s], its yaw rate [rad/s], how many
 obstacles are within reach; its best backup from here, whose clearance is the barrier; and a backup whose

@@ -66,7 +66,7 @@ class GuideConfig:
 _NOBODY, _NOTHING = np.empty(0, np.int64), np.empty((0, 2))
 _OWN = tuple(GuideConfig.__dataclass_fields__)
 _OF_FILTER = ("margin", "position_error", "bearing_error", "hazard_radius")
-GUIDE = np.dtype([("robot", ROBOT), *((name, "f8") for name in (*_OF_FILTER, *_OWN))])
+GUIDE = np.dtype([("robot", ROBOT), *((name, "f8") for name in (*_OF_FILTER, *_OWN))], align=True)
 """The numbers of a guide as compiled code takes them."""
 
 
@@ -155,20 +155,21 @@ def _leads(
     nominal: FloatArray,
     refused: bool,
     engaged: bool,
+    ahead: bool,
     side: int,
 ) -> tuple[bool, bool, Path]:
     """Whether to lead a robot in this step, whether it is still being led past something, and the way.
 
     It is led while a hazard stands in the straight way to the goal and the nominal action does not drive
-    round it by itself, and also where the robot hardly moves and the nominal action is refused: such a robot
-    would stay there. Whoever moves when the first action is refused is the filter's.
+    round it by itself; at strength ahead also where the robot hardly moves and the nominal action is refused,
+    for such a robot would stay there. Whoever moves when the first action is refused is the filter's.
     """
     seen, goal_x, goal_y = goal
     now = stopping(config.robot, state)
     way = shortest_path(discs, count, (goal_x, goal_y), (now.zx, now.zy), side, config.steadiness)
     hardly = math.hypot(now.zx, now.zy) < config.slow
     if not (seen and way.blocker >= 0 and way.distance < config.lookahead):
-        return seen and refused and hardly, False, way
+        return ahead and seen and refused and hardly, False, way
     if not (engaged or (refused and hardly)):
         return False, False, way
     return refused or not drives_round(config, discs, count, state, nominal, way), True, way
@@ -219,7 +220,7 @@ def lead(
         at = decode_goal(observation[k, goal : goal + LIDAR_BINS])
         engaged = ahead or past.guided != 0
         leads[k], led, way = _leads(
-            config, discs, count, at, state, proposed[k], not certified[k], engaged, past.guided
+            config, discs, count, at, state, proposed[k], not certified[k], engaged, ahead, past.guided
         )
         past.guided = way.side if led else 0
         hazard[k] = source[way.blocker] if way.blocker >= 0 else -1

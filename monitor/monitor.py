@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -135,29 +136,24 @@ class Monitor:
                 what the lidar shows. Hazards that the lidar shows beside the given ones count as well.
             memory: the `memory` of this robot's last decision; None before its first.
 
-        Returns:
-            The decision; a bad input or any fault inside gives mode "fallback" with the reason.
+        A bad input or any fault inside gives mode "fallback" with the reason.
         """
         past, lost = np.zeros(1, MEMORY), None
         try:
             past = _memory_of(1, memory)
         except ValueError as error:
-            self.faults.note("bad input", str(error))
-            lost = f"bad input: {error}"
+            lost = self._bad(error)
         try:
             row = np.array(observation, dtype=np.float64)[None]
             given = None if hazards is None else _one_robots_hazards(hazards)
         except (TypeError, ValueError) as error:
-            self.faults.note("bad input", str(error))
-            return self._fall_back(past, f"bad input: {error}")[0]
+            return self._fall_back(past, self._bad(error))[0]
         return self._decide_or_fall_back(row, given, past, lost)[0]
 
     def decide_batch(
         self, observation: ArrayLike, hazards: ArrayLike | None = None, memory: Memory | None = None
     ) -> Decisions:
-        """Decides for N robots at once, with the results of N calls of `decide`.
-
-        The risk score may differ in float32's last bit: onnxruntime rounds a row's softplus by its place.
+        """Decides for N robots at once, as N calls of `decide` would but for float32's last bit of the risk.
 
         Args:
             observation: (N, O).
@@ -222,24 +218,23 @@ class Monitor:
         if decided.action is not asked or decided.mode.shape != active.shape:
             self._check_decided(decided, asked, active)
         if not all_sound:
-            decided = self._planned(decided, nominal, risk, ~sound, lost)
+            decided = self._planned(
+                decided, [lost or self._wrong(*row) for row in zip(nominal, risk, sound, strict=True)]
+            )
         return decided.told(nominal, risk, self.gate.threshold, opened_by)
 
-    def _planned(
-        self,
-        decided: Decisions,
-        nominal: FloatArray,
-        risk: FloatArray,
-        rows: NDArray[np.bool_],
-        lost: str | None,
-    ) -> Decisions:
-        """Says of some rows that their plan was asked for in place of a policy's action, and why."""
-        reason = list(decided.reason)
-        for i in np.flatnonzero(rows):
-            reason[i] = lost
-            if lost is None:
-                reason[i] = f"the networks gave action {nominal[i].tolist()} and multiplier {risk[i]}"
-                self.faults.note("networks", str(reason[i]))
+    def _wrong(self, nominal: FloatArray, risk: float, sound: np.bool_) -> str | None:
+        """What is wrong with what the networks gave for a robot, noted; None if nothing is."""
+        if sound:
+            return None
+        reason = f"the networks gave action {nominal.tolist()} and multiplier {risk}"
+        self.faults.note("networks", reason)
+        return reason
+
+    def _planned(self, decided: Decisions, why: list[str | None]) -> Decisions:
+        """Says of rows for which there is a reason that their plan was asked for, not a policy's action."""
+        rows = np.array([reason is not None for reason in why])
+        reason = [new or old for new, old in zip(why, decided.reason, strict=True)]
         return replace(
             decided,
             mode=np.where(rows, texts(Mode.FALLBACK, len(rows)), decided.mode),
@@ -263,21 +258,20 @@ class Monitor:
     def _note(self, error: Exception) -> str:
         """Counts and logs what was caught; the reason for the decision."""
         if isinstance(error, FilterInputError):
-            self.faults.note("bad input", str(error))
-            return f"bad input: {error}"
+            return self._bad(error)
         reason = str(error) or type(error).__name__
         self.faults.note(type(error).__name__, reason, error)
         return reason
+
+    def _bad(self, error: Exception) -> str:
+        self.faults.note("bad input", str(error))
+        return f"bad input: {error}"
 
     def _fall_back(self, memory: Memory, reason: str) -> Decisions:
         return fall_back(memory, reason, self.gate.threshold, self._safe)
 
     def _warm_up(self) -> None:
-        """Runs the networks and every part of the filter once, with and without given hazards.
-
-        Raises:
-            MonitorError: if not even a robot at rest, nothing near, can be decided about.
-        """
+        """Runs every part once, or raises MonitorError if not even a robot at rest can be decided about."""
         blocks = layout(self.bundle.manifest.level)
         at_rest = np.zeros((1, blocks.size))
         at_rest[:, blocks.slice("accelerometer")] = (0.0, 0.0, 9.81)
@@ -285,20 +279,18 @@ class Monitor:
         decision = self.decide(at_rest[0])
         if decision.reason is not None:
             raise MonitorError(f"{self.bundle.path}: cannot decide about a robot at rest: {decision.reason}")
-        moving = at_rest.copy()
-        moving[:, blocks.slice("velocimeter")] = (1.0, 0.0, 0.0)
         asked = np.clip([[1.0, 0.0]], self._low, self._high)
-        for distance in (1.0, 0.7, 0.5, 0.3, 0.1):
-            scene = self._filter.look(moving, np.array([[[distance, 0.0]]]))
+        for speed, distance in product((1.0, 0.5, 0.0), (1.0, 0.7, 0.5, 0.3, 0.24, 0.22, 0.1)):
+            at_rest[:, blocks.slice("velocimeter")] = (speed, 0.0, 0.0)
+            scene = self._filter.look(at_rest, np.array([[[distance, 0.03]]]))
             self._filter.decide(scene, asked, np.zeros(1, MEMORY), np.ones(1, np.bool_))
-            self.decide(moving[0], [[distance, 0.0]])
+            self.decide(at_rest[0], [[distance, 0.03]])
 
 
 def _robot(bundle: Bundle) -> Robot:
     """The constants of the bundle's robot; the task's own where the manifest has none."""
-    constants: dict[str, Any] = dict(bundle.manifest.robot)
     try:
-        return Robot(**constants)
+        return Robot(**cast(dict[str, Any], bundle.manifest.robot))
     except TypeError as error:
         raise MonitorError(f"{bundle.path}: its robot: {error}") from error
 

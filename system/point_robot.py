@@ -59,7 +59,7 @@ class Robot(NamedTuple):
         return self.physics_step * self.substeps
 
 
-ROBOT = np.dtype([(name, "i8" if name == "substeps" else "f8") for name in Robot._fields])
+ROBOT = np.dtype([(name, "i8" if name == "substeps" else "f8") for name in Robot._fields], align=True)
 """`Robot` as compiled code takes it."""
 
 
