@@ -73,9 +73,12 @@ class Step:
         """(N,) clearance [m] that certifies what the filter puts in place of a refused action.
 
         It is 0, or what there is, if that is a little less: a robot that has lost a millimetre of its margin
-        may keep what it has.
+        may keep what it has. A robot that is off needs the margin for what it may lose in a step.
         """
-        inner = 0.5 * max(self.settings["margin"][0] - self.settings["sure"][0], 0.0)
+        one = self.settings[0]
+        robot = one["robot"]
+        way = robot["gear"] * robot["force_limit"] / robot["drag"] * robot["physics_step"] * robot["substeps"]
+        inner = max(0.5 * (one["margin"] - one["sure"]) - one["travel_error"] * way, 0.0)
         return np.asarray(np.minimum(np.maximum(self.scene.barrier, -inner), 0.0))
 
     def certify(self, rows: IntArray, action: FloatArray, least: FloatArray) -> BoolArray:

@@ -111,8 +111,7 @@ class Monitor:
 
         Raises:
             BundleError: if the bundle must not be used.
-            MonitorError: as the constructor, if the settings contradict the bundle, or if it cannot decide
-                about a robot at rest.
+            MonitorError: as the constructor, if the settings contradict the bundle, or it cannot decide at all.
         """
         bundle = Bundle.load(path)
         try:

@@ -17,6 +17,7 @@ from decision import Mode, OpenedBy
 from evaluation import demo
 from evaluation.closed_loop import run_episodes
 from evaluation.pictures import draw_drives, drive
+from guide import DEFAULT_STRENGTH
 
 
 def command(module: str, *arguments: object) -> subprocess.CompletedProcess[str]:
@@ -57,7 +58,7 @@ def test_by_default_the_filter_knows_what_the_task_promises(tiny_bundle: Path, t
     assert result.returncode == 0, result.stderr
     content = json.loads(figures.read_text())
     assert set(content["hazards"]) == {"lidar"}
-    assert content["decided_by"]["guide"] == "refusal"
+    assert content["decided_by"]["guide"] == DEFAULT_STRENGTH
     assert content["decided_by"]["threshold"] == 0.5
 
 

@@ -79,7 +79,7 @@ def test_what_the_service_has_not_is_refused(tiny_bundle: Path, monkeypatch) -> 
         for wrong, named in (
             (("--gate", "always"), "gate off"),
             (("--threshold", "0.1"), "threshold 0.5"),
-            (("--guide", "ahead"), "guide refusal"),
+            (("--guide", "off"), "guide ahead"),
         ):
             result = command("evaluation.evaluate", tiny_bundle, "--url", service.url, *wrong)
             assert result.returncode == 2

@@ -166,7 +166,7 @@ def test_what_cannot_be_decided_about_is_422_and_named(app, strict_json, body, w
     ("memory", "named"),
     [
         ({"side": 200, "guided": 0, "plan": []}, "memory.side"),
-        ({"side": 0, "guided": -1, "plan": []}, "memory.guided"),
+        ({"side": 0, "guided": -2, "plan": []}, "memory.guided"),
         ({"side": 0, "guided": 0, "plan": [[0.0, 1.5]]}, "memory.plan"),
     ],
 )
@@ -331,7 +331,7 @@ def test_the_model_is_told(app, monitor) -> None:
     assert [block["name"] for block in content["observation_layout"]][:2] == ["accelerometer", "velocimeter"]
     assert (content["gate"], content["threshold"]) == ("always", manifest.threshold)
     assert content["threshold_source"] == manifest.threshold_source
-    assert content["floor"] == monitor.gate.floor
+    assert content["robot"] == monitor.robot._asdict()
     assert content["guide"] == "refusal"
     assert content["robot"] == Robot()._asdict()
     assert (content["action_low"], content["action_high"]) == ([-1.0, -1.0], [1.0, 1.0])
