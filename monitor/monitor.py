@@ -111,7 +111,7 @@ class Monitor:
 
         Raises:
             BundleError: if the bundle must not be used.
-            MonitorError: as the constructor, if the settings contradict the bundle, or it cannot decide at all.
+            MonitorError: as the constructor, if the settings contradict the bundle, or it cannot decide.
         """
         bundle = Bundle.load(path)
         try:
