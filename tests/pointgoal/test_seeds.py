@@ -66,6 +66,7 @@ def train(seed: int) -> None:
     Run(config, None, make_environments(config))
 
 
+FILTERED = filter_closed_loop.Line("random", "plain", "given", "none", "off")
 USERS = {
     **{f"training {seed}": lambda seed=seed: train(seed) for seed in SEEDS},
     "calibration 0": lambda: play(run_of(0), 50, 1),
@@ -74,7 +75,7 @@ USERS = {
     "evaluation 0": lambda: run_episodes("PointGoal1-v0", None, 100),
     "evaluation 1": lambda: run_episodes("PointGoal1-v0", None, 100, 1),
     "demo": lambda: run_episodes("PointGoal1-v0", None, 20, use=Use.DEMO),
-    "filter": lambda: filter_closed_loop.run(filter_closed_loop.random_policy, None, "given", 100),
+    "filter": lambda: filter_closed_loop.run(FILTERED, 100),
     "simulation": lambda: simulation.measure(1, 100, 1, simulation.Settings()),
     **{f"plain {seed}": lambda seed=seed: PointGoalVectorEnv(1, 80).reset(seed=seed) for seed in SEEDS},
 }

@@ -15,6 +15,7 @@ from hypothesis.extra.numpy import arrays
 
 from decision import MEMORY, PLAN_STEPS, Decision, Faults, Mode, OpenedBy, Origin, memory_to_json
 from filter import Robot
+from guide import DEFAULT_STRENGTH
 from monitor import Monitor
 from server.app import MANY_FAULTS, Lifecycle, create_app
 from server.schema import ActReply, decision_of, reply_of
@@ -331,8 +332,7 @@ def test_the_model_is_told(app, monitor) -> None:
     assert [block["name"] for block in content["observation_layout"]][:2] == ["accelerometer", "velocimeter"]
     assert (content["gate"], content["threshold"]) == ("always", manifest.threshold)
     assert content["threshold_source"] == manifest.threshold_source
-    assert content["robot"] == monitor.robot._asdict()
-    assert content["guide"] == "refusal"
+    assert content["guide"] == DEFAULT_STRENGTH
     assert content["robot"] == Robot()._asdict()
     assert (content["action_low"], content["action_high"]) == ([-1.0, -1.0], [1.0, 1.0])
 

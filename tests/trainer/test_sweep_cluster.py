@@ -20,6 +20,7 @@ from trainer.sweep.worker import read_holder
 from trainer.train import train
 
 pytest.importorskip("ray")
+pytestmark = pytest.mark.long
 
 TINY = {
     "task": "PointGoal0-v0", "total_steps": 20_000, "epoch_steps": 400, "num_envs": 10, "minibatch": 400,
