@@ -2,10 +2,11 @@
 
 A robot that a policy keeps pushing straight at an obstacle would stand in front of it for ever, since a
 barrier row only takes its thrust away. The circulation row of the same QP turns it meanwhile: the heading's
-error from the way past the obstacle, on the side that needs the smaller turn and that the policy turns to,
-has to fall by a share in every control step (a circulation inequality, Gonçalves et al. 2024, in the heading, the input of
-relative degree one here). As soon as thrust no longer leads into the obstacle, the barrier rows give it back.
-The side is kept from obstacle to obstacle, so the robot follows the outline of what stands together.
+error from the way past the obstacle has to fall by a share in every control step (a circulation inequality,
+Gonçalves et al. 2024, in the heading, the input of relative degree one here). The side is the one that needs
+the smaller turn, that the policy turns to, and that was chosen before, from obstacle to obstacle, so that the
+robot follows the outline of what stands together. As soon as thrust no longer leads into the obstacle, the
+barrier rows give it back.
 """
 
 from __future__ import annotations
