@@ -128,7 +128,7 @@ class Decision:
         return np.asarray(self.memory["plan"][: self.memory["left"]])
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False, slots=True)
 class Decisions:
     """N robots' decisions; the fields are those of `Decision` with a leading axis (N,).
 

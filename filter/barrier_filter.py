@@ -25,6 +25,7 @@ LINEARISATIONS = (0.0, 0.0, 2.0, 0.0, 0.5, 0.1, 0.02)
 first, about the last solution afterwards. Above 0: about the best backup's own action, which is feasible, and
 the solution stays so near to it (2 leaves the whole box): a step is not smooth in the turn, whose servo
 chatters, so that a linearisation may hold nearby only."""
+_NOBODY = np.empty(0, np.int64)
 _CHUNK = 512
 """Robots handled at once: bounds the memory of the obstacles."""
 
@@ -83,12 +84,18 @@ class BarrierFilter:
         given = scene.check_hazards(hazards, n)
         gate = scene.check_active(active, n)
         past = scene.check_memory(memory, n)
-        parts = []
-        for start in range(0, max(n, 1), _CHUNK):
-            part = slice(start, start + _CHUNK)
-            view = scene.look(self._settings, seen[part], None if given is None else given[part])
-            parts.append(self.decide(view, nominal[part], past[part], gate[part]))
-        return Decisions.join(parts)
+        if n <= _CHUNK:
+            decisions = self.decide(scene.look(self._settings, seen, given), nominal, past, gate)
+        else:
+            parts = []
+            for start in range(0, n, _CHUNK):
+                part = slice(start, start + _CHUNK)
+                view = scene.look(self._settings, seen[part], None if given is None else given[part])
+                parts.append(self.decide(view, nominal[part], past[part], gate[part]))
+            decisions = Decisions.join(parts)
+        if active is not None:
+            decisions.opened_by = np.where(gate, decisions.opened_by, "")
+        return decisions
 
     def look(self, observation: ArrayLike, hazards: ArrayLike | None = None) -> Scene:
         """What N robots see, and the barrier; arguments and errors as for `filter`."""
@@ -96,18 +103,22 @@ class BarrierFilter:
         return scene.look(self._settings, seen, scene.check_hazards(hazards, len(seen)))
 
     def decide(self, view: Scene, nominal: FloatArray, memory: Memory, active: BoolArray) -> Decisions:
-        """Filter N actions for what is seen; arguments as for `filter`, all of them there and checked."""
+        """Filter N actions for what is seen; arguments as for `filter`, all of them there and checked.
+
+        Why the gate is open or closed is the caller's to say: the decisions say "always".
+        """
         step = Step(self._settings, view, nominal, memory, active)
         refused = active & ~step.certified
-        free = np.ones(len(nominal), np.bool_)
+        led: IntArray = _NOBODY
         if self.guide is not None:
             led, proposed = self.guide.propose(step)
             if led.size:
                 step.send(led, proposed, Mode.GUIDED, Origin.GUIDE)
                 refused[led] = ~step.certify(led, proposed, np.full(len(led), self.config.hysteresis))
-                free[led] = False
-        left = np.flatnonzero(refused)
+        left = refused.nonzero()[0]
         if left.size:
+            free = np.ones(len(nominal), np.bool_)
+            free[led] = False
             step.blame(left, view.source[left, step.nearest(left)])
             # Where the best backup keeps less than any certificate needs, there is none to be found.
             hopeless = view.barrier[left] < step.need[left]

@@ -357,13 +357,15 @@ def recover(
 def keep_plans(
     settings: Records,
     seen: Records,
-    rows: IntArray,
+    which: BoolArray,
     action: FloatArray,
     certificates: Records,
     memory: Records,
 ) -> None:
     """Write the backups of the certificates, from where ``action`` (N, 2) leads, to ``memory`` (N,)."""
-    for k in rows:
+    for k in range(len(which)):
+        if not which[k]:
+            continue
         one, past = certificates[k], memory[k]
         past.planned = True
         _plan(settings[0], _state(seen[k]), action[k, 0], action[k, 1], one.backup, one.steps, past)

@@ -62,7 +62,7 @@ class Programme:
         rows = self._count + self._circulating
         self._x, self.solved = solve_batch(solver, self._weights, self.reference, self._G, self._h, rows)
         self.circulates = self.solved & self._circulating
-        again = np.flatnonzero(~self.solved & self._circulating)
+        again = (~self.solved & self._circulating).nonzero()[0]
         if again.size:
             self._x[again], self.solved[again] = solve_batch(
                 solver,

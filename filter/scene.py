@@ -41,7 +41,7 @@ class _Columns:
 _COLUMNS = {where.size: _Columns.of(where) for where in (layout(0), layout(1))}
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False, slots=True)
 class Scene:
     """N robots and what is near them.
 

@@ -181,17 +181,12 @@ class Step:
             self._open[rows] = False
 
     def decisions(self) -> Decisions:
-        """The step, decided, and the plans that the certificates end in written down.
-
-        Whose gate is closed is said to have none open; why it is open is the caller's to say.
-        """
+        """The step, decided, and the plans that the certificates end in written down."""
         n, memory = len(self.action), self.memory
-        opened_by = texts(OpenedBy.ALWAYS, n)
-        if not self.active.all():
-            opened_by = np.where(self.active, opened_by, texts("", n))
         if self._open is not None:
-            rows = np.flatnonzero(self._open)
-            kernel.keep_plans(self.settings, self.scene.seen, rows, self.action, self.certificates, memory)
+            kernel.keep_plans(
+                self.settings, self.scene.seen, self._open, self.action, self.certificates, memory
+            )
         return Decisions(
             action=self.action,
             nominal_action=self.nominal,
@@ -203,6 +198,6 @@ class Step:
             reason=self._reason,
             risk=unknown(n),
             threshold=math.nan,
-            opened_by=opened_by,
+            opened_by=texts(OpenedBy.ALWAYS, n),
             memory=memory,
         )

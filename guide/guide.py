@@ -120,7 +120,7 @@ class Guide:
             leads,
             hazard,
         )
-        rows = np.flatnonzero(leads)
+        rows = leads.nonzero()[0]
         step.blame(rows, hazard[rows])
         return rows, proposed[rows]
 
