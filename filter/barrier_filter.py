@@ -107,8 +107,10 @@ class BarrierFilter:
 
         Why the gate is open or closed is the caller's to say: the decisions say "always".
         """
-        step = Step(self._settings, view, nominal, memory, active)
-        refused = active & ~step.certified
+        doubted = np.isnan(view.barrier)
+        doubtful = doubted.any()
+        step = Step(self._settings, view, nominal, memory, active & ~doubted if doubtful else active)
+        refused = step.active & ~step.certified
         led: IntArray = _NOBODY
         if self.guide is not None:
             led, proposed = self.guide.propose(step)
@@ -125,6 +127,8 @@ class BarrierFilter:
             hoped = left[~hopeless]
             hoped = self._by_search(step, self._by_qp(step, Programme(step, hoped, free[hoped])))
             self._fall_back(step, np.concatenate([left[hopeless], hoped]))
+        if doubtful:
+            step.distrust((active & doubted).nonzero()[0])
         return step.decisions()
 
     def problem(

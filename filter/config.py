@@ -75,19 +75,8 @@ class FilterConfig:
 
 
 _NUMBERS = (
-    "margin",
-    "sure",
-    "bearing_error",
-    "position_error",
-    "travel_error",
-    "hazard_radius",
-    "rate",
-    "keep_off",
-    "hysteresis",
-    "thrust_weight",
-    "circulation",
-    "pursuit",
-    "slow",
+    *("margin", "sure", "bearing_error", "position_error", "travel_error", "hazard_radius", "rate"),
+    *("keep_off", "hysteresis", "thrust_weight", "circulation", "pursuit", "slow"),
 )
 SETTINGS = np.dtype([("robot", ROBOT), *((name, "f8") for name in _NUMBERS)], align=True)
 """`FilterConfig`'s numbers as compiled code takes them: ``margin`` holds the position error as well, ``sure``

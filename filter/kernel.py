@@ -24,7 +24,7 @@ from pointgoal.observation import LIDAR_RANGE
 from system.backups import law
 from system.clearance import best_backup, clearances
 from system.compiled import compiled, entry
-from system.lidar import decode, unexplained
+from system.lidar import contradiction, decode, unexplained
 from system.obstacles import FAR, least_gap
 from system.point_robot import State, advance, follow, stopping
 
@@ -52,6 +52,8 @@ COMMITTED, UNKEPT, INSIDE = 0, 1, 2
 _GRID = 5
 """Thrusts, and turns, that the search tries."""
 _LARGEST = float(np.finfo(np.float32).max)
+_SCAN = 1e-3
+"""Contradiction between three readings that is let pass beside their errors: 3 mm."""
 _STANDS = 0.03
 """Way to the stop point up to which a robot stands [m]: 6 cm/s."""
 _THRUST_TIME = 0.02 * (PLAN_STEPS + 1)
@@ -105,7 +107,8 @@ def see(
     ``columns`` tells where in an ``observation`` (N, O) the velocity ahead, followed by that to the left,
     and the yaw rate stand, where the hazards' lidar starts and ends, and where the goal's starts. ``given``
     (N, n, 2) are hazards [m]; ``source`` (N, M) receives each obstacle's hazard, or n + its bin. Returns the
-    place of the first number of all observations that float32 cannot hold, -1 if there is none.
+    place of the first number of all observations that float32 cannot hold, -1 if there is none. A robot whose
+    scan contradicts itself has a barrier of NaN.
     """
     config = settings[0]
     velocity, yaw, first, last, _ = columns
@@ -118,7 +121,13 @@ def see(
         one.vy = observation[k, velocity + 1]
         one.yaw_rate = observation[k, yaw]
         state = _state(one)
-        one.count = _obstacles(config, state, given[k], observation[k, first:last], obstacles[k], source[k])
+        readings = observation[k, first:last]
+        if contradiction(readings, _SCAN + 3.0 * config.position_error / LIDAR_RANGE) >= 0:
+            one.count = 0
+            one.now.clearance, one.now.nearest, one.now.backup, one.now.steps = math.nan, -1, 0, 0
+            one.sure.clearance, one.sure.nearest, one.sure.backup, one.sure.steps = -FAR, -1, 0, 0
+            continue
+        one.count = _obstacles(config, state, given[k], readings, obstacles[k], source[k])
         at = stopping(config.robot, state)
         now = best_backup(config, obstacles[k], one.count, at, FAR, False)
         one.now.clearance = min(now[0], LIDAR_RANGE)

@@ -64,14 +64,8 @@ class Programme:
         self.circulates = self.solved & self._circulating
         again = (~self.solved & self._circulating).nonzero()[0]
         if again.size:
-            self._x[again], self.solved[again] = solve_batch(
-                solver,
-                self._weights,
-                self.reference[again],
-                self._G[again],
-                self._h[again],
-                self._count[again],
-            )
+            part = self.reference[again], self._G[again], self._h[again], self._count[again]
+            self._x[again], self.solved[again] = solve_batch(solver, self._weights, *part)
         self._x = np.where(self.solved[:, None], self._x, about)
 
     def action(self) -> FloatArray:

@@ -57,10 +57,6 @@ class Problem:
         length = np.maximum(np.linalg.norm(self.G, axis=1), 1e-9)
         return self.G / length[:, None], self.h / length
 
-    def objective(self, x: FloatArray) -> float:
-        """The weighted square distance from the reference, halved."""
-        return float(0.5 * self.weights @ (x - self.reference) ** 2)
-
 
 @compiled
 def after(settings: Settings, state: State, thrust: float, turn: float) -> Stopping:

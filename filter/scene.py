@@ -71,7 +71,10 @@ class Scene:
 
     @property
     def barrier(self) -> FloatArray:
-        """(N,) clearance [m] beyond the margin that the best backup keeps; at most the lidar's range."""
+        """(N,) clearance [m] beyond the margin that the best backup keeps; at most the lidar's range.
+
+        NaN where the hazards' lidar contradicts itself, see `system.lidar.contradiction`.
+        """
         barrier: FloatArray = self.seen["now"]["clearance"]
         return barrier
 

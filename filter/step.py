@@ -13,10 +13,12 @@ from filter import kernel
 from filter.certificate import CERTIFICATE
 from filter.scene import Scene
 from pointgoal.observation import LIDAR_RANGE
+from system.backups import braking
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
+_DOUBT = "the hazards' lidar shows what no hazards can"
 
 
 @lru_cache(maxsize=64)
@@ -57,16 +59,8 @@ class Step:
         self._reason: list[str | None] = [None] * n
         # Whose plans are still to be written down.
         self._open: BoolArray | None = None
-        self.refused = kernel.screen(
-            settings,
-            scene.seen,
-            scene.obstacles,
-            nominal,
-            active,
-            self.certificates,
-            self.certified,
-            self.memory,
-        )
+        told = self.certificates, self.certified, self.memory
+        self.refused = kernel.screen(settings, scene.seen, scene.obstacles, nominal, active, *told)
 
     @cached_property
     def need(self) -> FloatArray:
@@ -118,14 +112,7 @@ class Step:
             # A scan tells how far the nearest hazard is, though not where.
             edge = np.minimum(edge, LIDAR_RANGE * (1.0 - scene.readings[rows].max(axis=1)))
         kernel.recover(
-            self.settings,
-            scene.seen,
-            scene.obstacles,
-            rows,
-            edge - radius,
-            found,
-            self.certificates,
-            outcome,
+            self.settings, scene.seen, scene.obstacles, rows, edge - radius, found, self.certificates, outcome
         )
         return found, outcome
 
@@ -169,6 +156,15 @@ class Step:
             self.send(rows, action, Mode.FALLBACK, Origin.PLAN, reason)
             self._settled(rows)
 
+    def distrust(self, rows: IntArray) -> None:
+        """Of scans that contradict themselves nothing follows: some rows' plans go on, else they brake."""
+        planned = self.has_plan(rows)
+        self.go_on(rows[planned], f"{_DOUBT}: the plan goes on")
+        rest = rows[~planned]
+        brake = braking(self.settings["robot"][0], self.scene.seen["vx"][rest])
+        self.send(rest, brake, Mode.FALLBACK, Origin.HARM, f"{_DOUBT}: braking")
+        self.forget(rest)
+
     def forget(self, rows: IntArray) -> None:
         """Leave some rows without a plan."""
         self.memory["planned"][rows] = False
@@ -184,9 +180,8 @@ class Step:
         """The step, decided, and the plans that the certificates end in written down."""
         n, memory = len(self.action), self.memory
         if self._open is not None:
-            kernel.keep_plans(
-                self.settings, self.scene.seen, self._open, self.action, self.certificates, memory
-            )
+            sent = self._open, self.action, self.certificates
+            kernel.keep_plans(self.settings, self.scene.seen, *sent, memory)
         return Decisions(
             action=self.action,
             nominal_action=self.nominal,

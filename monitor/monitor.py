@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Protocol, cast
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from decision import (
     MEMORY,
@@ -28,7 +28,7 @@ from filter import BarrierFilter, FilterConfig, FilterInputError, Robot, Scene
 from guide import DEFAULT_STRENGTH, Guide, Strength
 from models import Bundle
 from monitor.errors import MonitorError, NetworkError
-from monitor.gate import Gate, GateName
+from monitor.gate import BoolArray, Gate, GateName
 from monitor.networks import FloatArray, Networks, within
 from pointgoal.observation import layout
 
@@ -39,9 +39,7 @@ class ActionFilter(Protocol):
     def look(self, observation: ArrayLike, hazards: ArrayLike | None = None) -> Scene:
         """What N robots see."""
 
-    def decide(
-        self, scene: Scene, nominal: FloatArray, memory: Memory, active: NDArray[np.bool_]
-    ) -> Decisions:
+    def decide(self, scene: Scene, nominal: FloatArray, memory: Memory, active: BoolArray) -> Decisions:
         """Filters N robots' nominal actions."""
 
 
@@ -165,9 +163,8 @@ class Monitor:
         """
         rows = np.array(observation, dtype=np.float64)
         if rows.ndim != 2:
-            raise ValueError(
-                f"observation must have shape [N, {self._networks.observation_size}], got {rows.shape}"
-            )
+            size = self._networks.observation_size
+            raise ValueError(f"observation must have shape [N, {size}], got {rows.shape}")
         given = None if hazards is None else np.asarray(hazards, dtype=np.float64)
         if given is not None and (given.ndim != 3 or given.shape[::2] != (len(rows), 2)):
             raise ValueError(f"hazards must have shape [{len(rows)}, n, 2], got {given.shape}")
@@ -185,12 +182,9 @@ class Monitor:
         # Something in one row spoils the batch: decide one by one, so that only its own robot gets the
         # fallback.
         rows = [slice(i, i + 1) for i in range(len(observation))]
-        return Decisions.join(
-            [
-                self._decide_or_fall_back(observation[i], None if hazards is None else hazards[i], memory[i])
-                for i in rows
-            ]
-        )
+        near = [None if hazards is None else hazards[i] for i in rows]
+        alone = zip((observation[i] for i in rows), near, (memory[i] for i in rows), strict=True)
+        return Decisions.join([self._decide_or_fall_back(*robot) for robot in alone])
 
     def _decide(
         self, observation: FloatArray, hazards: FloatArray | None, memory: Memory, lost: str | None
@@ -206,12 +200,18 @@ class Monitor:
         sound = np.empty(len(risk), np.bool_)
         all_sound = within(nominal, self._low, self._high, risk, sound) and lost is None
         opened_by = self.gate.opened_by(risk, scene.low)
+        doubted = np.isnan(scene.barrier)
+        if doubted.any() and self.gate.name != "off":
+            opened_by = np.where(doubted, texts(OpenedBy.FAULT, len(doubted)), opened_by)
+            self.faults.note("lidar", "the hazards' lidar shows what no hazards can")
         asked = nominal
         if not all_sound:
             sound &= lost is None
             opened_by = np.where(sound, opened_by, texts(OpenedBy.FAULT, len(sound)))
             planned, after = next_of_plan(memory)
-            asked, memory = np.where(sound[:, None], nominal, planned), np.where(sound, memory, after)
+            # Where the scan is doubted as well, it is the filter that goes on with the plan.
+            ahead = ~sound & ~doubted
+            asked, memory = np.where(sound[:, None], nominal, planned), np.where(ahead, after, memory)
         active = opened_by != ""
         decided = self._filter.decide(scene, asked, memory, active)
         if decided.action is not asked or decided.mode.shape != active.shape:
@@ -241,7 +241,7 @@ class Monitor:
             reason=reason,
         )
 
-    def _check_decided(self, decided: Decisions, asked: FloatArray, active: NDArray[np.bool_]) -> None:
+    def _check_decided(self, decided: Decisions, asked: FloatArray, active: BoolArray) -> None:
         """Trusts no filter: what it answers must be an action, and its mode must be true."""
         action = decided.action
         if action.shape != asked.shape or decided.mode.shape != active.shape:

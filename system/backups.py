@@ -13,6 +13,9 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+from numpy.typing import NDArray
+
 from system.compiled import compiled
 from system.point_robot import Robot, Stopping
 
@@ -30,6 +33,19 @@ def steered(robot: Robot, error: float) -> float:
     """The turn u2 in [-1, 1] that takes an error [rad] from the heading within a control step, or near."""
     gain = (robot.gear * robot.gear + robot.yaw_drag) / robot.gear
     return min(max(gain * error / (robot.physics_step * robot.substeps), -1.0), 1.0)
+
+
+def braking(robot: np.void, speed: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Actions (n, 2) that take half of the speeds ahead (n,) [m/s] within a step, or what thrust can.
+
+    Args:
+        robot: the constants, one of `ROBOT`.
+        speed: ahead of the robots, negative backwards.
+    """
+    action = np.zeros((len(speed), 2))
+    step = robot["gear"] / robot["mass"] * robot["physics_step"] * robot["substeps"]
+    action[:, 0] = np.clip(-_SHARE * speed / step, -robot["force_limit"], robot["force_limit"])
+    return action
 
 
 @compiled

@@ -40,6 +40,21 @@ _EXPLAINED = 1e-4
 
 
 @compiled
+def contradiction(readings: FloatArray, tolerance: float) -> int:
+    """The first bin (of 16, or of none) whose reading no hazards can give, -1 if every one may be true.
+
+    Such a reading is outside of [0, 1], or above the sum of its neighbours': whatever shows in a bin shows in
+    the two beside it as well, in shares that add up to it. Up to ``tolerance`` it counts as a rounding.
+    """
+    size = readings.size
+    for b in range(size):
+        beside = readings[(b + size - 1) % size] + readings[(b + 1) % size]
+        if not -tolerance <= readings[b] <= min(1.0, beside) + tolerance:
+            return b
+    return -1
+
+
+@compiled
 def shares(reading: float, before: float, after: float) -> tuple[float, float]:
     """The shares of the bin's width in which a hazard of this reading can be, given the neighbours'."""
     low = max(1.0 - before / reading - _ROUNDING, 0.0)
@@ -109,6 +124,10 @@ def decode(
             continue
         before = readings[(b + LIDAR_BINS - 1) % LIDAR_BINS]
         after = readings[(b + 1) % LIDAR_BINS]
+        # Where the three leave no place, each of them may be what is off.
+        slack = max(readings[b] - before - after, 0.0)
+        before += slack
+        after += slack
         strongest = min(readings[b], before + after, 1.0)
         if strongest <= 0.0:
             continue

@@ -8,6 +8,7 @@ import pytest
 from decision import MEMORY, Mode, Origin, next_of_plan
 from filter import BarrierFilter, FilterConfig
 from filter.config import MODEL_ERROR
+from guide import Guide
 from pointgoal.observation import HAZARD_RADIUS
 
 
@@ -140,6 +141,57 @@ def test_a_side_is_remembered_for_a_second_and_no_longer(robot_filter, hand):
         memory = result.memory
         assert memory["side"][0] == side * left
     assert robot_filter.filter(np.zeros((1, 60)), np.zeros((1, 2)), None, memory).memory["side"][0] == 0
+
+
+@pytest.mark.parametrize("guided", [False, True])
+def test_a_dead_lidar_bin_is_noticed_before_it_costs_anything(hand, drive, guided):
+    """Robots that are driven at the nearest hazard, each with another bin that shows nothing."""
+    robot_filter = BarrierFilter(guide=Guide() if guided else None)
+    dead = np.zeros((32, 60), np.bool_)
+    dead[np.arange(32), 28 + np.arange(32) % 16] = True
+    memory, doubted, moved = None, 0, 0
+    for now in drive(300, n=32, seed=41):
+        seen = np.where(dead, 0.0, now.observation)
+        result = robot_filter.filter(seen, hand.attacker(now.observation, now.hazards, None), None, memory)
+        told = np.array([reason is not None and "what no hazards can" in reason for reason in result.reason])
+        np.testing.assert_array_equal(told, np.isnan(result.barrier))
+        assert (result.mode[told] == Mode.FALLBACK).all()
+        doubted += told.sum()
+        moved += (result.mode == Mode.NOMINAL).sum()
+        memory, now.action = result.memory, result.action
+        assert (now.cost == 0.0).all()
+    assert doubted > 1000
+    assert moved > 100
+
+
+@pytest.mark.parametrize("index", [0, 1, 15])
+def test_of_a_scan_that_contradicts_itself_nothing_follows(robot_filter, hand, index):
+    at = 0.45 * np.array([np.cos(np.pi / 16), np.sin(np.pi / 16)])
+    whole = hand.observe(at, (1.0, 0.0))[None]
+    thrust = np.array([[1.0, 0.0]])
+    before = robot_filter.filter(whole, thrust)
+    assert before.memory["planned"][0]
+    broken = whole.copy()
+    broken[0, 28 + index] = 0.0
+    # With a plan: it goes on, then the robot coasts. Robots beside it are not concerned.
+    memory = np.concatenate([before.memory, before.memory])
+    plan = memory["plan"][0, : memory["left"][0]].tolist()
+    for action in [*plan, [0.0, 0.0], [0.0, 0.0]]:
+        result = robot_filter.filter(np.vstack([broken, whole]), np.vstack([thrust, thrust]), None, memory)
+        assert (result.mode[0], result.origin[0]) == (Mode.FALLBACK, Origin.PLAN)
+        assert result.action[0].tolist() == action
+        assert result.reason[1] is None
+        memory["plan"][0], memory["left"][0] = result.memory["plan"][0], result.memory["left"][0]
+    # Without one: it brakes, forwards and backwards, whatever is given beside the scan.
+    for speed in (1.0, -1.0, 0.0):
+        broken[0, 3] = speed
+        for given in (None, np.array([[[2.0, 0.0]]])):
+            result = robot_filter.filter(broken, thrust, given)
+            assert (result.mode[0], result.origin[0]) == (Mode.FALLBACK, Origin.HARM)
+            assert result.action[0].tolist() == [-0.05 * speed, 0.0]
+            assert not result.memory["planned"][0]
+    # A closed gate changes nothing.
+    assert robot_filter.filter(broken, thrust, active=[False]).mode[0] == Mode.NOMINAL
 
 
 def test_a_plan_that_was_left_is_forgotten(robot_filter, hand):

@@ -152,7 +152,10 @@ def test_no_point_of_a_grid_is_better(seed):
         assert not met.any()
         return
     assert problem.residual(x) <= 1e-9
-    better = 0.5 * ((grid[met] - problem.reference) ** 2 @ problem.weights) < problem.objective(x) - 1e-9
+    better = (
+        0.5 * ((grid[met] - problem.reference) ** 2 @ problem.weights)
+        < 0.5 * ((x - problem.reference) ** 2 @ problem.weights) - 1e-9
+    )
     assert not better.any()
 
 

@@ -14,6 +14,7 @@ from decision import MEMORY, SAFE_ACTION, Mode, OpenedBy, Origin
 from filter import FilterConfig, FilterError, FilterInputError, Robot
 from models import Bundle, write_bundle
 from monitor import Monitor, MonitorError, NetworkError
+from pointgoal.lidar import encode
 
 READINGS = st.floats(0.0, 1.0)
 MOTION = st.floats(-3.0, 3.0)
@@ -21,10 +22,13 @@ MOTION = st.floats(-3.0, 3.0)
 
 @st.composite
 def observations(draw: st.DrawFn) -> np.ndarray:
-    """Observations [60] that a robot can have: motion of a few metres a second, readings in [0, 1]."""
-    return np.concatenate(
+    """Observations [60]: motion of a few metres a second, readings in [0, 1], mostly scans of hazards."""
+    made = np.concatenate(
         [draw(arrays(np.float64, 12, elements=MOTION)), draw(arrays(np.float64, 48, elements=READINGS))]
     )
+    if draw(st.integers(0, 9)):
+        made[28:44] = encode(draw(arrays(np.float64, (1, 4, 2), elements=st.floats(-3.0, 3.0))))[0]
+    return made
 
 
 HAZARDS = st.none() | st.integers(0, 10).flatmap(
@@ -51,10 +55,15 @@ def test_what_holds_of_every_decision(monitors, observation, hazards, gate) -> N
     assert decision.risk >= 0.0
     if gate == "risk":
         opened = decision.opened_by
-        assert (opened == OpenedBy.RISK) == (decision.risk > decision.threshold)
-        assert opened in (None, OpenedBy.RISK, OpenedBy.BARRIER)
+        if np.isnan(decision.barrier):
+            assert opened == OpenedBy.FAULT
+        else:
+            assert (opened == OpenedBy.RISK) == (decision.risk > decision.threshold)
+            assert opened in (None, OpenedBy.RISK, OpenedBy.BARRIER)
+    elif gate == "always":
+        assert decision.opened_by == (OpenedBy.FAULT if np.isnan(decision.barrier) else OpenedBy.ALWAYS)
     else:
-        assert decision.opened_by == (OpenedBy.ALWAYS if gate == "always" else None)
+        assert decision.opened_by is None
     assert decision.gate_open == (decision.opened_by is not None)
     assert (decision.origin is None) == (decision.mode == "nominal")
     if decision.mode == "nominal":
@@ -80,7 +89,8 @@ def test_a_batch_decides_as_its_robots_alone(monitors, rows, given_hazards, gate
         assert same_bits(alone.action, together.action)
         assert alone.risk == pytest.approx(together.risk, rel=1e-6)
         for name in ("mode", "origin", "barrier", "hazard", "certified", "reason", "opened_by", "memory"):
-            assert getattr(alone, name) == getattr(together, name)
+            # As texts: NaN is not equal to itself.
+            assert str(getattr(alone, name)) == str(getattr(together, name))
 
 
 def test_the_gate_opens_above_the_threshold_and_not_at_it(build, at_rest) -> None:
@@ -494,3 +504,27 @@ def test_a_level_0_bundle_decides(make_bundle_of, tmp_path: Path) -> None:
     monitor = Monitor.load(make_bundle_of(tmp_path / "level0", level=0), "always")
     assert monitor.decide(np.zeros(28)).mode == "nominal"
     assert monitor.decide(np.zeros(60)).mode == "fallback"
+
+
+@pytest.mark.parametrize("gate", ["always", "risk"])
+def test_a_scan_that_contradicts_itself_opens_the_gate_and_is_counted(build, hand, gate) -> None:
+    networks = build.networks(action=[(1.0, 0.0)], risk=[0.0])
+    monitor = build(networks, gate=gate, threshold=1.0)
+    observation = hand.observe(np.array([[0.45, 0.05]]), (1.0, 0.0))
+    before = monitor.decide(observation)
+    dead = observation.copy()
+    dead[28] = 0.0
+    decision = monitor.decide(dead, memory=before.memory)
+    assert (decision.mode, decision.opened_by) == (Mode.FALLBACK, OpenedBy.FAULT)
+    np.testing.assert_array_equal(decision.action, before.plan[0])
+    assert np.isnan(decision.barrier)
+    assert "lidar" in decision.reason
+    assert monitor.faults.counts["lidar"] == 1
+    # The networks' fault beside it takes nothing more of the plan.
+    networks.action = [(np.nan, 0.0)]
+    both = monitor.decide(dead, memory=before.memory)
+    np.testing.assert_array_equal(both.action, decision.action)
+    np.testing.assert_array_equal(both.memory, decision.memory)
+    # With the gate off, nothing but the policy decides.
+    networks.action = [(1.0, 0.0)]
+    assert build(networks, gate="off").decide(dead).mode == Mode.NOMINAL

@@ -15,6 +15,7 @@ import pytest
 from fastapi.testclient import TestClient
 
 from monitor import Monitor
+from pointgoal.lidar import encode
 from server.app import create_app
 from server.schema import ModelReply
 
@@ -33,8 +34,10 @@ def app(monitor: Monitor) -> TestClient:
 
 @pytest.fixture
 def observation() -> list[float]:
-    """An observation [60]."""
-    return [float(value) for value in np.random.default_rng(5).uniform(0.0, 0.5, 60)]
+    """An observation [60] of a robot with a hazard in sight."""
+    made = np.random.default_rng(5).uniform(0.0, 0.5, 60)
+    made[28:44] = encode(np.array([[[1.2, 0.9]]]))[0]
+    return [float(value) for value in made]
 
 
 def no_constant(name: str) -> Any:

@@ -11,6 +11,7 @@ import pytest
 from decision import MEMORY, Decisions
 from evaluation.service import Service
 from monitor import Monitor
+from pointgoal.lidar import encode
 from pointgoal.observation import layout
 from pointgoal.vector import PointGoalVectorEnv
 from server import Client, ClientError, Fleet
@@ -36,13 +37,14 @@ def test_it_decides_as_the_monitor_does(service, monitor) -> None:
         assert fleet.model().model == monitor.bundle.id
         for count in (5, 5, 5):
             observation = rng.uniform(0.0, 0.5, (count, 60))
+            observation[1:, 28:44] = encode(rng.uniform(-1.5, 1.5, (count - 1, 3, 2)))
             hazards = rng.uniform(-1.0, 1.0, (count, 4, 2))
             hazards[1, 2] = hazards[3, 0] = np.nan  # rows that stand for none
             told = fleet.decide_batch(observation, hazards, memory)
             decided = monitor.decide_batch(observation, hazards, past)
             assert isinstance(told, Decisions)
             for name in ("action", "mode", "origin", "certified", "barrier", "hazard", "opened_by"):
-                assert np.array_equal(getattr(told, name), getattr(decided, name)), name
+                np.testing.assert_array_equal(getattr(told, name), getattr(decided, name), err_msg=name)
             assert np.allclose(told.risk, decided.risk, rtol=1e-6)
             assert (told.reason, told.threshold) == (decided.reason, decided.threshold)
             memory, past = told.memory, decided.memory

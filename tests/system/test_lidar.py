@@ -1,8 +1,9 @@
 import numpy as np
+import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from system.lidar import CONES, decode, decode_goal, likeliest, unexplained
+from system.lidar import CONES, contradiction, decode, decode_goal, likeliest, unexplained
 from system.obstacles import COLUMNS, gap
 
 RADIUS = 0.2
@@ -73,6 +74,62 @@ def test_a_hazard_alone_is_decoded_exactly(hand, distance, bearing):
     assert likeliest(hand.scan(at), ALL, 0.3, guess, labels, 0, 0) >= 1
     assert np.linalg.norm(guess[:3, :2] - at, axis=1).min() < 1e-6
     assert set(source) <= {(int(np.remainder(bearing, 2 * np.pi) * 8 / np.pi) + i) % 16 for i in (-1, 0, 1)}
+
+
+@settings(deadline=None, max_examples=300)
+@given(hazards=st.one_of(st.lists(places, max_size=10), crowds))
+def test_no_true_scan_contradicts_itself(hand, hazards):
+    readings = hand.scan(np.array(hazards).reshape(-1, 2))
+    assert contradiction(readings, 1e-9) == -1
+    # Nor does one in single precision.
+    assert contradiction(readings.astype(np.float32).astype(np.float64), 1e-6) == -1
+
+
+@settings(deadline=None, max_examples=300)
+@given(
+    distance=st.floats(0.0, 2.5), bearing=bearings, which=st.sampled_from([-1, 0, 1]), share=st.floats(0, 0.9)
+)
+def test_a_hazard_alone_whose_bin_or_neighbour_is_weakened_is_a_contradiction(
+    hand, distance, bearing, which, share
+):
+    at = np.array([[distance * np.cos(bearing), distance * np.sin(bearing)]])
+    readings = hand.scan(at)
+    top = int(readings.argmax())
+    changed = readings.copy()
+    changed[(top + which) % 16] *= share
+    lost = readings - changed
+    # Its own reading may fall to the larger of its neighbours' before they contradict it.
+    beside = max(readings[(top - 1) % 16], readings[(top + 1) % 16])
+    if which == 0:
+        assume(changed[top] < beside - 1e-2)
+    else:
+        assume(lost.max() > 1e-2)
+    assert contradiction(changed, 1e-3) >= 0
+
+
+@pytest.mark.parametrize("value", [-0.01, 1.01, 7.0, -np.inf, np.inf, np.nan])
+def test_a_reading_outside_of_the_range_is_a_contradiction(value):
+    readings = np.full(16, 0.6)
+    assert contradiction(readings, 1e-3) == -1
+    readings[5] = value
+    assert contradiction(readings, 1e-3) >= 0
+
+
+@settings(deadline=None, max_examples=200)
+@given(
+    distance=st.floats(0.3, 1.4),
+    bearing=bearings,
+    errors=st.lists(st.floats(-0.02, 0.02), min_size=16, max_size=16),
+)
+def test_readings_that_are_a_little_off_drop_no_hazard(hand, distance, bearing, errors):
+    """Within a tolerance the places of a hazard grow; they never become none."""
+    at = np.array([distance * np.cos(bearing), distance * np.sin(bearing)])
+    readings = hand.scan(at[None])
+    readings = np.where(readings > 0.02, np.clip(readings + errors, 0.0, 1.0), readings)
+    cones, _ = obstacles(readings)
+    # 0.02 of the range is 6 cm; the neighbours' shares move the bearing by at most three of them.
+    off = 0.06 + 0.06 * np.pi / 8 * distance / max(readings.max(), 0.5)
+    assert min((gap(cones, i, *at) for i in range(len(cones))), default=np.inf) <= off - RADIUS
 
 
 def test_out_of_range_is_nothing(hand):
