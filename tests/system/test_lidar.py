@@ -42,7 +42,7 @@ def obstacles(readings, reach=1.6, spread=0.0):
 def test_no_true_hazard_is_ever_nearer_than_what_was_decoded(hand, hazards):
     cones, _ = obstacles(hand.scan(np.array(hazards)))
     for x, y in hazards:
-        if np.hypot(x, y) > 1.6:
+        if np.hypot(x, y) > 1.6 - 1e-9:
             continue
         # Its whole disc lies in one obstacle, so it is nearer to nothing than that obstacle is.
         inside = min((gap(cones, i, x, y) for i in range(len(cones))), default=np.inf)
