@@ -31,6 +31,7 @@ from decision import PLAN_STEPS
 from evaluation.service import Service
 from models import Bundle
 from monitor import GateName
+from pointgoal.lidar import encode
 from pointgoal.observation import layout
 from server.serve import listen
 
@@ -133,8 +134,11 @@ def measure(targets: dict[str, tuple[str, bytes]], config: ServerBenchmark) -> d
 
 def run(config: ServerBenchmark) -> dict[str, dict[str, float]]:
     """Starts both services, measures them, stops them."""
-    level = Bundle.load(config.bundle).manifest.level
-    observation = np.random.default_rng(0).uniform(0.0, 0.6, layout(level).size).tolist()
+    where = layout(Bundle.load(config.bundle).manifest.level)
+    seen = np.random.default_rng(0).uniform(0.0, 0.6, where.size)
+    if "hazards_lidar" in where:
+        seen[where.slice("hazards_lidar")] = encode(np.array([[[1.5, 1.2]]]))[0]
+    observation = seen.tolist()
     plain = json.dumps({"observation": observation}).encode()
     given: dict[str, Any] = {
         "observation": observation,

@@ -3,12 +3,13 @@
 from filter.barrier_filter import BarrierFilter
 from filter.config import FilterConfig
 from filter.errors import FilterError, FilterInputError, SolverError
-from filter.scene import Scene
+from filter.scene import DOUBT, Scene
 from filter.step import Step
 from filter.wrapper import SafetyFilter
 from system.point_robot import Robot
 
 __all__ = [
+    "DOUBT",
     "BarrierFilter",
     "FilterConfig",
     "FilterError",

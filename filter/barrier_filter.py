@@ -107,9 +107,8 @@ class BarrierFilter:
 
         Why the gate is open or closed is the caller's to say: the decisions say "always".
         """
-        doubted = np.isnan(view.barrier)
-        doubtful = doubted.any()
-        step = Step(self._settings, view, nominal, memory, active & ~doubted if doubtful else active)
+        doubtful = view.doubted.any()
+        step = Step(self._settings, view, nominal, memory, active & ~view.doubted if doubtful else active)
         refused = step.active & ~step.certified
         led: IntArray = _NOBODY
         if self.guide is not None:
@@ -128,7 +127,7 @@ class BarrierFilter:
             hoped = self._by_search(step, self._by_qp(step, Programme(step, hoped, free[hoped])))
             self._fall_back(step, np.concatenate([left[hopeless], hoped]))
         if doubtful:
-            step.distrust((active & doubted).nonzero()[0])
+            step.distrust((active & view.doubted).nonzero()[0])
         return step.decisions()
 
     def problem(

@@ -24,7 +24,7 @@ from pointgoal.observation import LIDAR_RANGE
 from system.backups import law
 from system.clearance import best_backup, clearances
 from system.compiled import compiled, entry
-from system.lidar import contradiction, decode, unexplained
+from system.lidar import contradictory, decode, unexplained
 from system.obstacles import FAR, least_gap
 from system.point_robot import State, advance, follow, stopping
 
@@ -122,7 +122,7 @@ def see(
         one.yaw_rate = observation[k, yaw]
         state = _state(one)
         readings = observation[k, first:last]
-        if contradiction(readings, _SCAN + 3.0 * config.position_error / LIDAR_RANGE) >= 0:
+        if contradictory(readings, _SCAN + 3.0 * config.position_error / LIDAR_RANGE):
             one.count = 0
             one.now.clearance, one.now.nearest, one.now.backup, one.now.steps = math.nan, -1, 0, 0
             one.sure.clearance, one.sure.nearest, one.sure.backup, one.sure.steps = -FAR, -1, 0, 0

@@ -17,6 +17,9 @@ from system.obstacles import COLUMNS
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
+DOUBT = "the hazards' lidar shows what no hazards can"
+"""What is said of a scan that contradicts itself."""
+
 
 @dataclass(frozen=True)
 class _Columns:
@@ -52,6 +55,7 @@ class Scene:
         seen: (N,) of `kernel.SEEN`: motion, count of obstacles, best backup.
         obstacles: (N, M, COLUMNS); of each robot's, the first ``seen["count"]`` count.
         source: (N, M) each one's hazard, or, behind those, its lidar bin.
+        doubted: (N,) whether the hazards' lidar contradicts itself; their barrier is NaN.
     """
 
     observation: FloatArray
@@ -60,6 +64,7 @@ class Scene:
     seen: NDArray[np.void]
     obstacles: FloatArray
     source: NDArray[np.int64]
+    doubted: BoolArray
 
     def __len__(self) -> int:
         return len(self.seen)
@@ -71,10 +76,7 @@ class Scene:
 
     @property
     def barrier(self) -> FloatArray:
-        """(N,) clearance [m] beyond the margin that the best backup keeps; at most the lidar's range.
-
-        NaN where the hazards' lidar contradicts itself, see `system.lidar.contradiction`.
-        """
+        """(N,) clearance [m] beyond the margin that the best backup keeps; at most the lidar's range."""
         barrier: FloatArray = self.seen["now"]["clearance"]
         return barrier
 
@@ -101,7 +103,8 @@ def look(settings: NDArray[np.void], observation: FloatArray, given: FloatArray 
     bad = see(settings, observation, columns.read, given, seen, obstacles, source)
     if bad >= 0:
         raise FilterInputError(f"observation[{bad % width}]", f"must be finite, got {observation.flat[bad]}")
-    return Scene(observation, columns.read, given, seen, obstacles, source)
+    doubted = np.isnan(seen["now"]["clearance"])
+    return Scene(observation, columns.read, given, seen, obstacles, source, doubted)
 
 
 def check_observation(observation: ArrayLike) -> FloatArray:

@@ -11,14 +11,13 @@ from numpy.typing import NDArray
 from decision import Decisions, Memory, Mode, OpenedBy, Origin, next_of_plan, texts, unknown
 from filter import kernel
 from filter.certificate import CERTIFICATE
-from filter.scene import Scene
+from filter.scene import DOUBT, Scene
 from pointgoal.observation import LIDAR_RANGE
 from system.backups import braking
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
-_DOUBT = "the hazards' lidar shows what no hazards can"
 
 
 @lru_cache(maxsize=64)
@@ -159,10 +158,10 @@ class Step:
     def distrust(self, rows: IntArray) -> None:
         """Of scans that contradict themselves nothing follows: some rows' plans go on, else they brake."""
         planned = self.has_plan(rows)
-        self.go_on(rows[planned], f"{_DOUBT}: the plan goes on")
+        self.go_on(rows[planned], f"{DOUBT}: the plan goes on")
         rest = rows[~planned]
         brake = braking(self.settings["robot"][0], self.scene.seen["vx"][rest])
-        self.send(rest, brake, Mode.FALLBACK, Origin.HARM, f"{_DOUBT}: braking")
+        self.send(rest, brake, Mode.FALLBACK, Origin.HARM, f"{DOUBT}: braking")
         self.forget(rest)
 
     def forget(self, rows: IntArray) -> None:

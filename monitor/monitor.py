@@ -24,7 +24,7 @@ from decision import (
     next_of_plan,
     texts,
 )
-from filter import BarrierFilter, FilterConfig, FilterInputError, Robot, Scene
+from filter import DOUBT, BarrierFilter, FilterConfig, FilterInputError, Robot, Scene
 from guide import DEFAULT_STRENGTH, Guide, Strength
 from models import Bundle
 from monitor.errors import MonitorError, NetworkError
@@ -200,17 +200,16 @@ class Monitor:
         sound = np.empty(len(risk), np.bool_)
         all_sound = within(nominal, self._low, self._high, risk, sound) and lost is None
         opened_by = self.gate.opened_by(risk, scene.low)
-        doubted = np.isnan(scene.barrier)
-        if doubted.any() and self.gate.name != "off":
-            opened_by = np.where(doubted, texts(OpenedBy.FAULT, len(doubted)), opened_by)
-            self.faults.note("lidar", "the hazards' lidar shows what no hazards can")
+        if scene.doubted.any() and self.gate.name != "off":
+            opened_by = np.where(scene.doubted, texts(OpenedBy.FAULT, len(scene)), opened_by)
+            self.faults.note("lidar", DOUBT)
         asked = nominal
         if not all_sound:
             sound &= lost is None
             opened_by = np.where(sound, opened_by, texts(OpenedBy.FAULT, len(sound)))
             planned, after = next_of_plan(memory)
             # Where the scan is doubted as well, it is the filter that goes on with the plan.
-            ahead = ~sound & ~doubted
+            ahead = ~sound & ~scene.doubted
             asked, memory = np.where(sound[:, None], nominal, planned), np.where(ahead, after, memory)
         active = opened_by != ""
         decided = self._filter.decide(scene, asked, memory, active)

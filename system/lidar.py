@@ -40,8 +40,8 @@ _EXPLAINED = 1e-4
 
 
 @compiled
-def contradiction(readings: FloatArray, tolerance: float) -> int:
-    """The first bin (of 16, or of none) whose reading no hazards can give, -1 if every one may be true.
+def contradictory(readings: FloatArray, tolerance: float) -> bool:
+    """Whether some bin (of 16, or of none) has a reading that no hazards can give.
 
     Such a reading is outside of [0, 1], or above the sum of its neighbours': whatever shows in a bin shows in
     the two beside it as well, in shares that add up to it. Up to ``tolerance`` it counts as a rounding.
@@ -50,8 +50,8 @@ def contradiction(readings: FloatArray, tolerance: float) -> int:
     for b in range(size):
         beside = readings[(b + size - 1) % size] + readings[(b + 1) % size]
         if not -tolerance <= readings[b] <= min(1.0, beside) + tolerance:
-            return b
-    return -1
+            return True
+    return False
 
 
 @compiled
@@ -128,13 +128,13 @@ def decode(
         slack = max(readings[b] - before - after, 0.0)
         before += slack
         after += slack
-        strongest = min(readings[b], before + after, 1.0)
+        strongest = min(readings[b], 1.0)
         if strongest <= 0.0:
             continue
         nearest = LIDAR_RANGE * (1.0 - strongest)
         for piece in range(PIECES):
             start = nearest + _EDGES[piece]
-            if start > reach:
+            if start > reach + _ROUNDING:
                 break
             end = min(nearest + _EDGES[piece + 1] if piece + 1 < PIECES else max(reach, start), LIDAR_RANGE)
             if start >= end and piece > 0:
