@@ -107,7 +107,7 @@ class BarrierFilter:
 
         Why the gate is open or closed is the caller's to say: the decisions say "always".
         """
-        doubtful = view.doubted.any()
+        doubtful = np.count_nonzero(view.doubted) > 0
         step = Step(self._settings, view, nominal, memory, active & ~view.doubted if doubtful else active)
         refused = step.active & ~step.certified
         led: IntArray = _NOBODY

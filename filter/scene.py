@@ -121,7 +121,7 @@ def check_action(action: ArrayLike, n: int) -> FloatArray:
     checked = _array("nominal_action", action)
     if checked.shape != (n, 2):
         raise FilterInputError("nominal_action", f"expected shape ({n}, 2), got {checked.shape}")
-    if not np.isfinite(checked).all():
+    if not _all(np.isfinite(checked)):
         raise FilterInputError("nominal_action", "has values that are not finite")
     return np.minimum(np.maximum(checked, -1.0), 1.0)
 
@@ -134,7 +134,7 @@ def check_hazards(hazards: ArrayLike | None, n: int) -> FloatArray | None:
     if given.ndim != 3 or given.shape[0] != n or given.shape[2] != 2:
         raise FilterInputError("hazards", f"expected shape ({n}, n, 2), got {given.shape}")
     finite = np.isfinite(given)
-    if not finite.all() and not (finite.all(axis=2) | np.isnan(given).all(axis=2)).all():
+    if not _all(finite) and not (finite.all(axis=2) | np.isnan(given).all(axis=2)).all():
         raise FilterInputError("hazards", "has values that are not finite; an absent hazard is NaN in both")
     return given
 
@@ -156,6 +156,11 @@ def check_memory(memory: Memory | None, n: int) -> Memory:
     if not isinstance(memory, np.ndarray | np.void) or memory.dtype != MEMORY or memory.size != n:
         raise FilterInputError("memory", f"expected that of {n} robots")
     return memory.reshape(n)
+
+
+def _all(values: BoolArray) -> bool:
+    # `values.all()` takes five times as long for a few.
+    return bool(np.count_nonzero(values) == values.size)
 
 
 def _array(field: str, values: ArrayLike) -> FloatArray:
