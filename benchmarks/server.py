@@ -145,7 +145,7 @@ def run(config: ServerBenchmark) -> dict[str, dict[str, float]]:
         "hazards": [[1.0 + 0.2 * k, 0.3 * k] for k in range(8)],
     }
     plan = [[0.05, 0.5]] * PLAN_STEPS
-    driving = given | {"request": 1, "memory": {"side": 5, "guided": 0, "plan": plan}}
+    driving = given | {"request": 1, "memory": {"side": 5, "guided": 0, "open": 0, "plan": plan}}
     with ExitStack() as stack:
         service = stack.enter_context(Service.start(config.bundle, config.gate))
         echo = stack.enter_context(Service.run([sys.executable, "-m", "benchmarks.server", "--echo"]))

@@ -8,10 +8,20 @@ from decision.decider import BatchDecider, Decider
 from decision.decision import SAFE_ACTION, Decision, Decisions, Mode, OpenedBy, Origin, texts, unknown
 from decision.fallback import fall_back
 from decision.faults import Faults
-from decision.memory import MEMORY, PLAN_STEPS, Memory, memory_from_json, memory_to_json, next_of_plan
+from decision.memory import (
+    MEMORY,
+    MOST_OPEN,
+    PLAN_STEPS,
+    Memory,
+    memory_from_json,
+    memory_of,
+    memory_to_json,
+    next_of_plan,
+)
 
 __all__ = [
     "MEMORY",
+    "MOST_OPEN",
     "PLAN_STEPS",
     "SAFE_ACTION",
     "BatchDecider",
@@ -25,6 +35,7 @@ __all__ = [
     "Origin",
     "fall_back",
     "memory_from_json",
+    "memory_of",
     "memory_to_json",
     "next_of_plan",
     "texts",

@@ -75,6 +75,9 @@ class OpenedBy(StrEnum):
     """The risk score is above the threshold, or is no number."""
     BARRIER = "barrier"
     """The barrier is below the floor, and the risk score is not above the threshold."""
+    DWELL = "dwell"
+    """It was open and stays so: the risk score has not been low for long enough, or the filter has the robot
+    in hand. Where the score is above the threshold that is the cause."""
     FAULT = "fault"
     """Something failed."""
 
@@ -204,6 +207,29 @@ class Decisions:
     def gate_open(self) -> NDArray[np.bool_]:
         """(N,) whether the filter was active."""
         return np.asarray(self.opened_by != "")
+
+    def check(self, asked: FloatArray, active: NDArray[np.bool_], low: FloatArray, high: FloatArray) -> None:
+        """Trust no filter: what it answers must be actions, and its modes must be true.
+
+        Args:
+            asked: (N, 2) the actions that it was to look at.
+            active: (N,) where it may change them.
+            low: (2,) the actions' lower bounds.
+            high: (2,) their upper bounds.
+
+        Raises:
+            ValueError: saying what is wrong.
+        """
+        action, mode = self.action, self.mode
+        if action.shape != asked.shape or mode.shape != active.shape:
+            raise ValueError(f"the filter gave action {action.shape} and mode {mode.shape}")
+        if not ((action >= low) & (action <= high)).all():
+            raise ValueError(f"the filter gave an action outside of its bounds: {action.tolist()}")
+        changed = (action.view(np.int64) != asked.view(np.int64)).any(axis=1)
+        if (changed & (mode == Mode.NOMINAL)).any():
+            raise ValueError("the filter changed an action and called it nominal")
+        if (changed & ~active).any():
+            raise ValueError("the filter changed an action though its gate is closed")
 
     @staticmethod
     def join(parts: Sequence[Decisions]) -> Decisions:

@@ -11,14 +11,25 @@ from numpy.typing import NDArray
 PLAN_STEPS = 20
 """Control steps for which a plan thrusts at most: 0.4 s; a full brake from top speed takes 0.36 s."""
 
+MOST_OPEN = 1000
+"""Control steps for which a gate stays open at most: 20 s."""
+
 MEMORY = np.dtype(
-    [("plan", "f8", (PLAN_STEPS, 2)), ("side", "i4"), ("left", "i2"), ("guided", "i1"), ("planned", "?")],
+    [
+        ("plan", "f8", (PLAN_STEPS, 2)),
+        ("side", "i2"),
+        ("left", "i2"),
+        ("open", "i2"),
+        ("guided", "i1"),
+        ("planned", "?"),
+    ],
     align=True,
 )
 """One robot's memory; zeros before its first step.
 
 - ``side``: the side on which the robot passes what is in its way, 1 left, -1 right, 0 none, times the steps
   for which that is still remembered.
+- ``open``: for how many more control steps the gate stays open, whatever opened it.
 - ``guided``: the side on which the guide is leading the robot past something, 1 left, -1 right, else 0.
 - ``planned``: whether there is a certified plan; one without actions is to coast.
 - ``left``: how many actions of the plan are left.
@@ -27,6 +38,19 @@ MEMORY = np.dtype(
 
 Memory = NDArray[np.void]
 """(N,) of `MEMORY`: rows are taken, masked and joined like any array's."""
+
+
+def memory_of(count: int, memory: Memory | np.void | None) -> Memory:
+    """The memory (count,) of so many robots; None is that before a first step.
+
+    Raises:
+        ValueError: if it is not that of so many robots.
+    """
+    if memory is None:
+        return np.zeros(count, MEMORY)
+    if getattr(memory, "dtype", None) != MEMORY or memory.size != count:
+        raise ValueError(f"the memory is not that of {count} robot{'s' * (count != 1)}")
+    return np.asarray(memory).reshape(count)
 
 
 def next_of_plan(memory: Memory) -> tuple[NDArray[np.float64], Memory]:
@@ -50,6 +74,7 @@ def memory_to_json(memory: np.void) -> dict[str, Any]:
     return {
         "side": int(memory["side"]),
         "guided": int(memory["guided"]),
+        "open": int(memory["open"]),
         "plan": memory["plan"][:left].tolist() if memory["planned"] else None,
     }
 
@@ -61,12 +86,12 @@ def memory_from_json(value: Mapping[str, Any]) -> Memory:
         ValueError: if the value is not a memory that this version wrote; the message names the field.
     """
     memory = np.zeros(1, MEMORY)
-    if set(value) != {"side", "guided", "plan"}:
-        raise ValueError(f"memory has the fields {sorted(value)}, expected guided, plan, side")
-    for name, least in (("side", -127), ("guided", -1)):
+    if set(value) != {"side", "guided", "open", "plan"}:
+        raise ValueError(f"memory has the fields {sorted(value)}, expected guided, open, plan, side")
+    for name, least, most in (("side", -127, 127), ("guided", -1, 1), ("open", 0, MOST_OPEN)):
         number = value[name]
-        if isinstance(number, bool) or not isinstance(number, int) or not least <= number <= -least:
-            raise ValueError(f"memory.{name} must be a whole number in {least}..{-least}, got {number!r}")
+        if isinstance(number, bool) or not isinstance(number, int) or not least <= number <= most:
+            raise ValueError(f"memory.{name} must be a whole number in {least}..{most}, got {number!r}")
         memory[name] = number
     if value["plan"] is None:
         return memory

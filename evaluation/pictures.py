@@ -37,6 +37,7 @@ _SENT = {Mode.FILTERED: "#f48c06", Mode.GUIDED: "#4cc9f0", Mode.FALLBACK: "#1b26
 """Of what was sent in place of the nominal action."""
 _CAUSES = {
     OpenedBy.RISK: "#7b2cbf",
+    OpenedBy.DWELL: "#cdb4e6",
     OpenedBy.BARRIER: "#70a80b",
     OpenedBy.ALWAYS: "#0077b6",
     OpenedBy.FAULT: "#000000",
@@ -342,7 +343,7 @@ def _draw_gates(axes: Axes, drives: Mapping[str, Drive]) -> None:
     axes.set_yticks([height for height, _ in ticks], [words for _, words in ticks])
     axes.set_ylim(-0.1, 2.4 * max(len(drives), 1) - 0.4)
     axes.tick_params(axis="y", length=0)
-    names = {OpenedBy.RISK: "risk", OpenedBy.BARRIER: "barrier alone"}
+    names = {OpenedBy.DWELL: "it stayed open", OpenedBy.BARRIER: "barrier alone"}
     marks = [Line2D([], [], color=_CAUSES[cause], lw=6.5) for cause in _CAUSES if cause in seen]
     words = [names.get(cause, str(cause)) for cause in _CAUSES if cause in seen]
     place: dict[str, Any] = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.05)}

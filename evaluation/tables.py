@@ -19,6 +19,7 @@ _STYLE: dict[str, Any] = {"box": box.SIMPLE_HEAD, "pad_edge": False, "padding": 
 _CAUSES = {
     OpenedBy.ALWAYS: "it always is",
     OpenedBy.RISK: "by risk",
+    OpenedBy.DWELL: "it stayed open",
     OpenedBy.BARRIER: "by barrier alone",
     OpenedBy.FAULT: "by fault",
 }

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from decision import MEMORY, Memory
+from decision import Memory, memory_of
 from filter.errors import FilterInputError
 from filter.kernel import SEEN, see
 from pointgoal.observation import ObservationLayout, layout
@@ -151,11 +151,10 @@ def check_active(active: ArrayLike | None, n: int) -> BoolArray:
 
 def check_memory(memory: Memory | None, n: int) -> Memory:
     """(N,) of `MEMORY`, or FilterInputError; None: a first step's."""
-    if memory is None:
-        return np.zeros(n, MEMORY)
-    if not isinstance(memory, np.ndarray | np.void) or memory.dtype != MEMORY or memory.size != n:
-        raise FilterInputError("memory", f"expected that of {n} robots")
-    return memory.reshape(n)
+    try:
+        return memory_of(n, memory)
+    except ValueError as error:
+        raise FilterInputError("memory", str(error)) from error
 
 
 def _all(values: BoolArray) -> bool:

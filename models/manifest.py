@@ -53,6 +53,8 @@ class Manifest(_Strict):
         action_high: upper bounds of the action.
         threshold: the gate `risk` activates the filter where λ is above this.
         threshold_source: how the threshold was set.
+        hysteresis: an open gate stays open while λ is above this share of the threshold.
+        dwell: for how many control steps after that it still stays open.
         hazard_radius: radius of a hazard [m].
         robot: the robot's constants, name → number, as `system.Robot` names them; empty: the task's own.
         opset: version of the standard ONNX operators that both graphs use.
@@ -74,6 +76,8 @@ class Manifest(_Strict):
     action_high: Pair
     threshold: Annotated[float, Field(ge=0.0)]
     threshold_source: Annotated[str, Field(min_length=1)]
+    hysteresis: Annotated[float, Field(gt=0.0, le=1.0)] = 1.0
+    dwell: Annotated[int, Field(ge=0, le=1000)] = 0
     hazard_radius: Annotated[float, Field(gt=0.0)]
     robot: dict[str, Annotated[int | float, Field(gt=0)]] = {}
     opset: Positive

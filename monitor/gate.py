@@ -9,7 +9,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from decision import OpenedBy, texts
+from decision import MOST_OPEN, Memory, OpenedBy, texts
 from monitor.errors import MonitorError
 
 FloatArray = NDArray[np.float64]
@@ -22,19 +22,24 @@ GATES: tuple[GateName, ...] = get_args(GateName)
 
 @dataclass(frozen=True)
 class Gate:
-    """Opens early where the risk score is high, and at the latest where the barrier is low.
+    """Opens early where the risk score is high, and at the latest where the barrier is low; closes late.
 
     Attributes:
         name: `risk` opens where risk > threshold, and where the barrier is so low that some action might lead
             below 0, whatever the risk says; `always` and `off` look at neither.
         threshold: finite and at least 0.
+        hysteresis: in (0, 1]. An open gate `risk` stays open while risk > hysteresis · threshold, while the
+            barrier is low, and while the filter sends another action than the policy's.
+        dwell: for how many control steps after that it still stays open, in a robot's memory.
 
     Raises:
-        MonitorError: for an unknown name or a threshold that is none.
+        MonitorError: for an unknown name, or a number that is out of its range.
     """
 
     name: GateName
     threshold: float
+    hysteresis: float = 1.0
+    dwell: int = 0
 
     def __post_init__(self) -> None:
         """Refuse what is no gate."""
@@ -42,16 +47,33 @@ class Gate:
             raise MonitorError(f"gate must be one of {', '.join(GATES)}, got {self.name!r}")
         if not (math.isfinite(self.threshold) and self.threshold >= 0.0):
             raise MonitorError(f"threshold must be finite and at least 0, got {self.threshold}")
+        if not 0.0 < self.hysteresis <= 1.0:
+            raise MonitorError(f"hysteresis must be above 0 and at most 1, got {self.hysteresis}")
+        if not 0 <= self.dwell <= MOST_OPEN:
+            raise MonitorError(f"dwell must be 0 to {MOST_OPEN} control steps, got {self.dwell}")
 
-    def opened_by(self, risk: FloatArray, low: BoolArray) -> NDArray[np.str_]:
+    def opened_by(self, risk: FloatArray, low: BoolArray, memory: Memory) -> NDArray[np.str_]:
         """What opens the gate for N robots: texts of `OpenedBy`, "" where it stays closed.
 
         Args:
             risk: (N,) the risk score; NaN opens the gate.
             low: (N,) whether the barrier is below its floor, see `filter.Scene.low`.
+            memory: (N,) of `MEMORY`.
         """
         n = len(risk)
         if self.name != "risk":
             return texts(OpenedBy.ALWAYS if self.name == "always" else "", n)
         opened = np.where(low, texts(OpenedBy.BARRIER, n), texts("", n))
+        opened = np.where(memory["open"] > 0, texts(OpenedBy.DWELL, n), opened)
         return np.where(risk <= self.threshold, opened, texts(OpenedBy.RISK, n))
+
+    def remember(self, risk: FloatArray, low: BoolArray, changed: BoolArray, memory: Memory) -> None:
+        """Write into N robots' memory how long their gates stay open; arguments as for `opened_by`.
+
+        ``changed`` (N,): whether the filter sends another action than the policy's.
+        """
+        if self.name == "risk" and self.dwell:
+            engaged = ~(risk <= self.threshold * self.hysteresis) | low | changed
+            before = memory["open"]
+            opened = (before > 0) | ~(risk <= self.threshold) | low
+            memory["open"] = np.where(engaged & opened, self.dwell, np.maximum(before - 1, 0))

@@ -21,6 +21,7 @@ from decision import (
     OpenedBy,
     Origin,
     fall_back,
+    memory_of,
     next_of_plan,
     texts,
 )
@@ -82,7 +83,7 @@ class Monitor:
         self.guide: Strength = guide
         self.faults = Faults()
         wanted = manifest.threshold if threshold is None else float(threshold)
-        self.gate = Gate(gate, wanted)
+        self.gate = Gate(gate, wanted, manifest.hysteresis, manifest.dwell)
         self._networks = networks
         self._filter = action_filter
         self._low = np.array(manifest.action_low, np.float64)
@@ -137,7 +138,7 @@ class Monitor:
         """
         past, lost = np.zeros(1, MEMORY), None
         try:
-            past = _memory_of(1, memory)
+            past = memory_of(1, memory)
         except ValueError as error:
             lost = self._bad(error)
         try:
@@ -168,7 +169,7 @@ class Monitor:
         given = None if hazards is None else np.asarray(hazards, dtype=np.float64)
         if given is not None and (given.ndim != 3 or given.shape[::2] != (len(rows), 2)):
             raise ValueError(f"hazards must have shape [{len(rows)}, n, 2], got {given.shape}")
-        return self._decide_or_fall_back(rows, given, _memory_of(len(rows), memory))
+        return self._decide_or_fall_back(rows, given, memory_of(len(rows), memory))
 
     def _decide_or_fall_back(
         self, observation: FloatArray, hazards: FloatArray | None, memory: Memory, lost: str | None = None
@@ -199,7 +200,7 @@ class Monitor:
             raise NetworkError(f"the networks gave shapes {nominal.shape} and {risk.shape}")
         sound = np.empty(len(risk), np.bool_)
         all_sound = within(nominal, self._low, self._high, risk, sound) and lost is None
-        opened_by = self.gate.opened_by(risk, scene.low)
+        opened_by = self.gate.opened_by(risk, scene.low, memory)
         if scene.doubted.any() and self.gate.name != "off":
             opened_by = np.where(scene.doubted, texts(OpenedBy.FAULT, len(scene)), opened_by)
             self.faults.note("lidar", DOUBT)
@@ -214,11 +215,12 @@ class Monitor:
         active = opened_by != ""
         decided = self._filter.decide(scene, asked, memory, active)
         if decided.action is not asked or decided.mode.shape != active.shape:
-            self._check_decided(decided, asked, active)
+            decided.check(asked, active, self._low, self._high)
         if not all_sound:
             decided = self._planned(
                 decided, [lost or self._wrong(*row) for row in zip(nominal, risk, sound, strict=True)]
             )
+        self.gate.remember(risk, scene.low, decided.mode != Mode.NOMINAL, decided.memory)
         return decided.told(nominal, risk, self.gate.threshold, opened_by)
 
     def _wrong(self, nominal: FloatArray, risk: float, sound: np.bool_) -> str | None:
@@ -239,19 +241,6 @@ class Monitor:
             origin=np.where(rows & (decided.mode == Mode.NOMINAL), Origin.PLAN, decided.origin),
             reason=reason,
         )
-
-    def _check_decided(self, decided: Decisions, asked: FloatArray, active: BoolArray) -> None:
-        """Trusts no filter: what it answers must be an action, and its mode must be true."""
-        action = decided.action
-        if action.shape != asked.shape or decided.mode.shape != active.shape:
-            raise ValueError(f"the filter gave action {action.shape} and mode {decided.mode.shape}")
-        if not ((action >= self._low) & (action <= self._high)).all():
-            raise ValueError(f"the filter gave an action outside of its bounds: {action.tolist()}")
-        changed = (action.view(np.int64) != asked.view(np.int64)).any(axis=1)
-        if (changed & (decided.mode == Mode.NOMINAL)).any():
-            raise ValueError("the filter changed an action and called it nominal")
-        if (changed & ~active).any():
-            raise ValueError("the filter changed an action though its gate is closed")
 
     def _note(self, error: Exception) -> str:
         """Counts and logs what was caught; the reason for the decision."""
@@ -317,15 +306,6 @@ def _one_robots_hazards(hazards: ArrayLike) -> FloatArray:
     if not np.isfinite(given).all():
         raise ValueError(f"hazards must be finite, got {given[~np.isfinite(given).all(axis=1)][0].tolist()}")
     return given[None]
-
-
-def _memory_of(count: int, memory: Memory | np.void | None) -> Memory:
-    """The memory (count,) of so many robots; None is that before a first step."""
-    if memory is None:
-        return np.zeros(count, MEMORY)
-    if getattr(memory, "dtype", None) != MEMORY or memory.size != count:
-        raise ValueError(f"the memory is not that of {count} robots")
-    return np.asarray(memory).reshape(count)
 
 
 def _check_layout(bundle: Bundle) -> None:

@@ -109,7 +109,7 @@ def test_what_is_told_of_policy_and_gate_changes_nothing_else(batch) -> None:
 def test_the_names_are_texts_for_users() -> None:
     assert [*Mode] == ["nominal", "guided", "filtered", "fallback"]
     assert [*Origin] == ["barrier", "circulation", "search", "plan", "least harm", "guide"]
-    assert [*OpenedBy] == ["always", "risk", "barrier", "fault"]
+    assert [*OpenedBy] == ["always", "risk", "barrier", "dwell", "fault"]
 
 
 SCRIPT = """
@@ -118,7 +118,7 @@ for name in ("numba", "scipy", "onnxruntime", "onnx", "pydantic", "fastapi", "os
              "mujoco", "gymnasium"):
     sys.modules[name] = None
 import decision
-decision.next_of_plan(decision.memory_from_json({"side": 0, "guided": 0, "plan": [[0.0, 1.0]]}))
+decision.next_of_plan(decision.memory_from_json({"side": 0, "guided": 0, "open": 0, "plan": [[0.0, 1.0]]}))
 rooms = {"system", "filter", "guide", "monitor", "models", "server", "trainer", "evaluation", "pointgoal"}
 assert not rooms & set(sys.modules)
 foreign = {name.split(".")[0] for name in sys.modules} - set(sys.stdlib_module_names) - {"decision", "numpy"}

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from decision import MEMORY, PLAN_STEPS, memory_from_json, memory_to_json, next_of_plan
+from decision import MEMORY, MOST_OPEN, PLAN_STEPS, memory_from_json, memory_to_json, next_of_plan
 
 controls = st.floats(-1.0, 1.0)
 
@@ -20,6 +20,7 @@ def memories(draw: st.DrawFn) -> np.ndarray:
     memory = np.zeros(1, MEMORY)
     plan = draw(st.lists(st.tuples(controls, controls), max_size=PLAN_STEPS))
     memory["side"], memory["guided"] = draw(st.integers(-127, 127)), draw(st.integers(-1, 1))
+    memory["open"] = draw(st.integers(0, MOST_OPEN))
     memory["planned"], memory["left"] = draw(st.booleans()) or bool(plan), len(plan)
     memory["plan"][0, : len(plan)] = np.array(plan).reshape(-1, 2)
     return memory
@@ -44,7 +45,7 @@ def good() -> dict:
     [
         (lambda m: m.clear(), "memory has the fields"),
         (lambda m: m.update(extra=[0]), "extra"),
-        (lambda m: m.pop("side"), "expected guided, plan, side"),
+        (lambda m: m.pop("side"), "expected guided, open, plan, side"),
         (lambda m: m.update(side=[]), r"memory\.side"),
         (lambda m: m.update(side=0.5), r"memory\.side"),
         (lambda m: m.update(side=1e300), r"memory\.side"),
@@ -56,6 +57,9 @@ def good() -> dict:
         (lambda m: m.update(guided=-2), r"memory\.guided"),
         (lambda m: m.update(guided=2), r"memory\.guided"),
         (lambda m: m.update(guided=None), r"memory\.guided"),
+        (lambda m: m.update(open=-1), r"memory\.open"),
+        (lambda m: m.update(open=MOST_OPEN + 1), r"memory\.open"),
+        (lambda m: m.update(open=False), r"memory\.open"),
         (lambda m: m.update(plan="fast"), r"memory\.plan"),
         (lambda m: m.update(plan=[1.0]), r"memory\.plan"),
         (lambda m: m.update(plan=[[1.0, 0.0, 0.0]]), r"memory\.plan"),

@@ -80,12 +80,16 @@ def monitors(tiny_bundle: Path) -> dict[GateName, Monitor]:
 
 @pytest.fixture
 def build(tiny_bundle: Path) -> Callable[..., Monitor]:
-    """Builds a monitor from the real parts, or from those given; the filter has a guide."""
+    """Builds a monitor from the real parts, or from those given; the filter has a guide.
+
+    What else is named is what the bundle's manifest states.
+    """
     bundle = Bundle.load(tiny_bundle)
 
-    def builder(networks=None, action_filter=None, gate="always", threshold=None) -> Monitor:
+    def builder(networks=None, action_filter=None, gate="always", threshold=None, **stated) -> Monitor:
         own = action_filter or BarrierFilter(guide=Guide())
-        return Monitor(bundle, networks or Networks(bundle), own, gate, threshold)
+        told = replace(bundle, manifest=bundle.manifest.model_copy(update=stated))
+        return Monitor(told, networks or Networks(bundle), own, gate, threshold)
 
     builder.networks = ScriptedNetworks
     builder.filter = ScriptedFilter

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from decision import MEMORY, Mode, OpenedBy
+from decision import MEMORY, MOST_OPEN, Mode, OpenedBy
 from monitor import GATES, Gate, MonitorError
 from pointgoal.observation import HAZARD_RADIUS
 
@@ -13,23 +13,99 @@ from pointgoal.observation import HAZARD_RADIUS
 def test_what_opens_it() -> None:
     risk = np.array([0.4, 0.5, np.nextafter(0.5, 1.0), np.nan, np.inf, 0.4, 0.9])
     low = np.array([False, False, False, False, False, True, True])
-    opened = Gate("risk", 0.5).opened_by(risk, low)
+    fresh = np.zeros(7, MEMORY)
+    opened = Gate("risk", 0.5).opened_by(risk, low, fresh)
     assert opened.tolist() == ["", "", "risk", "risk", "risk", "barrier", "risk"]
-    assert Gate("always", 0.5).opened_by(risk, low).tolist() == ["always"] * 7
-    assert Gate("off", 0.5).opened_by(risk, low).tolist() == [""] * 7
+    held = np.zeros(7, MEMORY)
+    held["open"] = [1, 0, 1, 0, 0, 1, 1]
+    opened = Gate("risk", 0.5).opened_by(risk, low, held)
+    assert opened.tolist() == ["dwell", "", "risk", "risk", "risk", "dwell", "risk"]
+    assert Gate("always", 0.5).opened_by(risk, low, fresh).tolist() == ["always"] * 7
+    assert Gate("off", 0.5).opened_by(risk, low, held).tolist() == [""] * 7
     assert GATES == ("risk", "always", "off")
     # Every reason fits, whatever the first rows say.
     for gate in GATES:
-        assert Gate(gate, 0.5).opened_by(risk, low).dtype.itemsize // 4 >= max(map(len, OpenedBy))
+        assert Gate(gate, 0.5).opened_by(risk, low, fresh).dtype.itemsize // 4 >= max(map(len, OpenedBy))
 
 
 @pytest.mark.parametrize(
-    ("name", "threshold"),
-    [("sometimes", 0.5), ("risk", np.nan), ("risk", -0.1), ("risk", np.inf), ("off", np.nan)],
+    ("settings", "named"),
+    [
+        (("sometimes", 0.5), "gate"),
+        *((("risk", threshold), "threshold") for threshold in (np.nan, -0.1, np.inf)),
+        (("off", np.nan), "threshold"),
+        *((("risk", 0.5, hysteresis), "hysteresis") for hysteresis in (0.0, 1.01, -0.5, np.nan)),
+        *((("risk", 0.5, 0.5, dwell), "dwell") for dwell in (-1, MOST_OPEN + 1)),
+    ],
 )
-def test_what_is_no_gate_is_refused(name, threshold) -> None:
-    with pytest.raises(MonitorError, match="gate" if name == "sometimes" else "threshold"):
-        Gate(name, threshold)
+def test_what_is_no_gate_is_refused(settings, named) -> None:
+    with pytest.raises(MonitorError, match=named):
+        Gate(*settings)
+
+
+def opened(gate: Gate, risks: list[float], low: list[bool], changed: list[bool]) -> list[str]:
+    """What opens a gate, step after step, for one robot that starts without a memory."""
+    memory, causes = np.zeros(1, MEMORY), []
+    for now in zip(risks, low, changed, strict=True):
+        risk, is_low, is_changed = (np.array([value]) for value in now)
+        causes.append(str(gate.opened_by(risk, is_low, memory)[0]))
+        gate.remember(risk, is_low, is_changed & (causes[-1] != ""), memory)
+    return causes
+
+
+NO = [False] * 8
+
+
+def test_it_closes_after_its_dwell() -> None:
+    gate = Gate("risk", 0.5, dwell=3)
+    risks = [0.1, 0.6, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1]
+    assert opened(gate, risks, NO, NO) == ["", "risk", "dwell", "dwell", "dwell", "", "", ""]
+    # And memoryless without one, as bundles are that state none.
+    assert opened(Gate("risk", 0.5), risks, NO, NO) == ["", "risk", *[""] * 6]
+
+
+def test_hysteresis_keeps_it_open_and_never_opens_it() -> None:
+    gate = Gate("risk", 0.5, hysteresis=0.6, dwell=2)
+    assert opened(gate, [0.4] * 8, NO, NO) == [""] * 8
+    risks = [0.6, 0.4, 0.31, 0.4, 0.3, 0.1, 0.4, 0.4]
+    assert opened(gate, risks, NO, NO) == ["risk", *["dwell"] * 5, "", ""]
+
+
+def test_it_does_not_close_while_the_filter_has_the_robot_in_hand() -> None:
+    gate = Gate("risk", 0.5, dwell=1)
+    risks, changed = [0.6, *[0.0] * 7], [True, True, True, True, False, False, False, False]
+    assert opened(gate, risks, NO, changed) == ["risk", *["dwell"] * 4, "", "", ""]
+
+
+def test_a_barrier_that_opened_it_keeps_it_open_for_the_dwell() -> None:
+    gate = Gate("risk", 0.5, dwell=2)
+    low = [False, True, True, False, False, False, False, False]
+    assert opened(gate, [0.0] * 8, low, NO) == ["", "barrier", "dwell", "dwell", "dwell", "", "", ""]
+
+
+def test_a_risk_that_is_no_number_keeps_it_open() -> None:
+    assert opened(Gate("risk", 0.5, dwell=1), [np.nan, 0.0, np.nan, *[0.0] * 5], NO, NO) == [
+        *("risk", "dwell", "risk", "dwell"),
+        *[""] * 4,
+    ]
+
+
+def test_the_monitor_remembers_it_for_each_robot(build, at_rest) -> None:
+    """Two robots, of which one had a high score; without their memory neither knows."""
+    networks = build.networks([[0.02, 0.2]], [0.0])
+    monitor = build(networks, gate="risk", threshold=0.5, hysteresis=0.5, dwell=4)
+    networks.risk = [0.9, 0.1]
+    seen = np.array([at_rest, at_rest])
+    first = monitor.decide_batch(seen)
+    assert first.opened_by.tolist() == ["risk", ""]
+    assert first.memory["open"].tolist() == [4, 0]
+    networks.risk = [0.0]
+    second = monitor.decide_batch(seen, memory=first.memory)
+    assert second.opened_by.tolist() == ["dwell", ""]
+    assert second.memory["open"].tolist() == [3, 0]
+    assert monitor.decide_batch(seen).opened_by.tolist() == ["", ""]
+    alone = monitor.decide(at_rest, memory=first.memory[0])
+    assert (alone.opened_by, alone.memory["open"]) == (OpenedBy.DWELL, 3)
 
 
 def test_the_gate_opens_above_the_threshold_and_not_at_it(build, at_rest) -> None:

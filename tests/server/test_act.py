@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from decision import MEMORY, PLAN_STEPS, Decision, Faults, Mode, OpenedBy, Origin, memory_to_json
+from decision import MEMORY, MOST_OPEN, PLAN_STEPS, Decision, Faults, Mode, OpenedBy, Origin, memory_to_json
 from filter import Robot
 from guide import DEFAULT_STRENGTH
 from monitor import Monitor
@@ -57,9 +57,9 @@ def decisions() -> st.SearchStrategy[Decision]:
     action = arrays(np.float64, 2, elements=st.floats(-1.0, 1.0))
     numbers = st.floats(-1e9, 1e9) | st.just(float("nan"))
 
-    def memory(side: int, guided: int, plan: list[np.ndarray] | None) -> np.void:
+    def memory(side: int, guided: int, opened: int, plan: list[np.ndarray] | None) -> np.void:
         made = np.zeros(1, MEMORY)
-        made["side"], made["guided"] = side, guided
+        made["side"], made["guided"], made["open"] = side, guided, opened
         if plan is not None:
             made["planned"], made["left"] = True, len(plan)
             made["plan"][0, : len(plan)] = np.reshape(plan, (-1, 2))
@@ -82,6 +82,7 @@ def decisions() -> st.SearchStrategy[Decision]:
             memory,
             st.integers(-127, 127),
             st.integers(-1, 1),
+            st.integers(0, MOST_OPEN),
             st.none() | st.lists(action, max_size=PLAN_STEPS),
         ),
     )
@@ -144,13 +145,13 @@ NUMBERS = "[" + ", ".join(["0.5"] * 59) + ", {}]"
             for memory, where in (
                 ("3", ["memory"]),
                 ("{}", ["memory", "side"]),
-                ('{"side": 0, "guided": 0, "plan": [], "x": 1}', ["memory", "x"]),
-                ('{"side": 1.5, "guided": 0, "plan": []}', ["memory", "side"]),
-                ('{"side": true, "guided": 0, "plan": []}', ["memory", "side"]),
-                ('{"side": 0, "guided": null, "plan": []}', ["memory", "guided"]),
-                ('{"side": 0, "guided": 0, "plan": [[0]]}', ["memory", "plan", 0]),
-                ('{"side": 0, "guided": 0, "plan": [[NaN, 0]]}', ["memory", "plan", 0, 0]),
-                (f'{{"side": 0, "guided": 0, "plan": {[[0, 0]] * 21}}}', ["memory", "plan"]),
+                ('{"side": 0, "guided": 0, "open": 0, "plan": [], "x": 1}', ["memory", "x"]),
+                ('{"side": 1.5, "guided": 0, "open": 0, "plan": []}', ["memory", "side"]),
+                ('{"side": true, "guided": 0, "open": 0, "plan": []}', ["memory", "side"]),
+                ('{"side": 0, "guided": null, "open": 0, "plan": []}', ["memory", "guided"]),
+                ('{"side": 0, "guided": 0, "open": 0, "plan": [[0]]}', ["memory", "plan", 0]),
+                ('{"side": 0, "guided": 0, "open": 0, "plan": [[NaN, 0]]}', ["memory", "plan", 0, 0]),
+                (f'{{"side": 0, "guided": 0, "open": 0, "plan": {[[0, 0]] * 21}}}', ["memory", "plan"]),
             )
         ),
         (f'{{"observation": {NUMBERS.format(1)}, "request": -1}}'.encode(), ["body", "request"]),
@@ -166,9 +167,11 @@ def test_what_cannot_be_decided_about_is_422_and_named(app, strict_json, body, w
 @pytest.mark.parametrize(
     ("memory", "named"),
     [
-        ({"side": 200, "guided": 0, "plan": []}, "memory.side"),
-        ({"side": 0, "guided": -2, "plan": []}, "memory.guided"),
-        ({"side": 0, "guided": 0, "plan": [[0.0, 1.5]]}, "memory.plan"),
+        ({"side": 200, "guided": 0, "open": 0, "plan": []}, "memory.side"),
+        ({"side": 0, "guided": -2, "open": 0, "plan": []}, "memory.guided"),
+        ({"side": 0, "guided": 0, "open": -1, "plan": []}, "memory.open"),
+        ({"side": 0, "guided": 0, "open": MOST_OPEN + 1, "plan": []}, "memory.open"),
+        ({"side": 0, "guided": 0, "open": 0, "plan": [[0.0, 1.5]]}, "memory.plan"),
     ],
 )
 def test_a_memory_that_no_reply_held_is_422_and_named(app, observation, memory, named) -> None:
@@ -186,7 +189,7 @@ def test_finite_nonsense_gets_the_fallback(app, strict_json, observation) -> Non
     assert "observation[0]" in content["reason"]
     assert content["action"] == [0.0, 0.0]
     # A robot that has a plan goes on with it.
-    body["memory"] = {"side": 0, "guided": 0, "plan": [[0.05, -1.0], [0.03, 0.0]]}
+    body["memory"] = {"side": 0, "guided": 0, "open": 0, "plan": [[0.05, -1.0], [0.03, 0.0]]}
     content = strict_json(app.post("/act", json=body).text)
     assert (content["mode"], content["origin"]) == ("fallback", "plan")
     assert content["action"] == [0.05, -1.0]
@@ -280,7 +283,7 @@ def test_whatever_comes_is_decided_or_refused_in_strict_json(
 
 def test_the_memory_of_a_reply_is_taken_back(app, observation) -> None:
     memory = app.post("/act", json={"observation": observation}).json()["memory"]
-    assert set(memory) == {"side", "guided", "plan"}
+    assert set(memory) == {"side", "guided", "open", "plan"}
     assert app.post("/act", json={"observation": observation, "memory": memory}).status_code == 200
 
 

@@ -86,7 +86,7 @@ def good(asked: bytes) -> dict[str, object]:
         "risk": 0.1,
         "threshold": 0.5,
         "opened_by": "always",
-        "memory": {"side": 3, "guided": 1, "plan": PLAN},
+        "memory": {"side": 3, "guided": 1, "open": 0, "plan": PLAN},
         "gate_open": True,
         "gate": "always",
         "model": MODEL[0],
@@ -200,9 +200,9 @@ def test_a_service_that_misbehaves_leaves_the_robot_with_its_plan_in_time(
         ({"nominal_action": [0.02, 0.4]}, "nominal"),
         ({"nominal_action": None}, "nominal"),
         ({"memory": None}, "not one"),
-        ({"memory": {"side": 0, "guided": 0, "plan": [[0.0, 0.0]] * (PLAN_STEPS + 1)}}, "not one"),
-        ({"memory": {"side": 0, "guided": 0, "plan": [[0.0, 2.0]]}}, "memory.plan"),
-        ({"memory": {"side": 10**30, "guided": 0, "plan": []}}, "memory.side"),
+        ({"memory": {"side": 0, "guided": 0, "open": 0, "plan": [[0.0, 0.0]] * (PLAN_STEPS + 1)}}, "not one"),
+        ({"memory": {"side": 0, "guided": 0, "open": 0, "plan": [[0.0, 2.0]]}}, "memory.plan"),
+        ({"memory": {"side": 10**30, "guided": 0, "open": 0, "plan": []}}, "memory.side"),
         ({"model": "other@000000000000"}, "of model other@000000000000"),
         ({"gate": "off"}, "of gate off"),
         ({"threshold": 0.6}, "of threshold 0.6"),
@@ -234,7 +234,7 @@ def test_a_good_reply_is_the_decision(fake, monitor, observation) -> None:
         client.decide(np.array(observation), memory=decision.memory)
     assert "memory" not in asked[0]
     assert asked[0]["hazards"] == [[1.0, 2.0]]
-    assert asked[1]["memory"] == {"side": 3, "guided": 1, "plan": PLAN}
+    assert asked[1]["memory"] == {"side": 3, "guided": 1, "open": 0, "plan": PLAN}
     assert asked[0]["observation"] == asked[1]["observation"] == observation
     assert asked[0]["request"] != asked[1]["request"]
 
@@ -381,7 +381,7 @@ def test_hazards_that_cannot_be_sent(fake, monitor, observation, bad) -> None:
         np.zeros(2, MEMORY),
         np.zeros(0, MEMORY),
         np.zeros(1),
-        {"side": 0, "guided": 0, "plan": PLAN},
+        {"side": 0, "guided": 0, "open": 0, "plan": PLAN},
         planned([[float("nan"), 0.0]]),
         planned([[0.0, 1.5]]),
     ],
