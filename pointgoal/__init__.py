@@ -20,9 +20,10 @@ def register_environments() -> None:
         if name not in gymnasium.registry:
             gymnasium.register(
                 id=name,
-                entry_point="pointgoal.environment:PointGoalEnv",
+                entry_point="pointgoal.environment:unlimited",
                 vector_entry_point="pointgoal.vector:PointGoalVectorEnv",
                 kwargs={"level": level},
+                max_episode_steps=1000,
             )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 import gymnasium
@@ -9,7 +10,7 @@ import numpy as np
 
 from pointgoal.observation import FloatArray, layout
 from pointgoal.rendering import draw
-from pointgoal.simulation import CostKind, Simulation, State
+from pointgoal.simulation import EPISODE_STEPS, CostKind, Simulation, State
 from pointgoal.vector import action_space, observation_space
 
 _ROW = np.array([0])
@@ -26,11 +27,20 @@ class PointGoalEnv(gymnasium.Env[FloatArray, FloatArray]):
         level: 0, 1 or 2.
         cost: ``"depth"``, metres inside hazards (the paper's), or ``"indicator"``, 1 if that is above 0.
         render_mode: ``"rgb_array"`` or None.
+        max_episode_steps: steps after which an episode is truncated; None: never.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012
 
-    def __init__(self, level: int = 1, cost: CostKind = "depth", render_mode: str | None = None) -> None:
+    def __init__(
+        self,
+        level: int = 1,
+        cost: CostKind = "depth",
+        render_mode: str | None = None,
+        max_episode_steps: int | None = EPISODE_STEPS,
+    ) -> None:
+        if max_episode_steps is not None and max_episode_steps < 1:
+            raise ValueError(f"max_episode_steps must be at least 1, got {max_episode_steps}")
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
         self.level = level
@@ -38,7 +48,7 @@ class PointGoalEnv(gymnasium.Env[FloatArray, FloatArray]):
         self.layout = layout(level)
         self.observation_space = observation_space(self.layout)
         self.action_space = action_space()
-        self.simulation = Simulation(level, 1, cost)
+        self.simulation = Simulation(level, 1, cost, episode_steps=max_episode_steps)
         self._cost = 0.0
         self._running = False
 
@@ -120,6 +130,20 @@ class PointGoalEnv(gymnasium.Env[FloatArray, FloatArray]):
     def elapsed_steps(self) -> int:
         """Steps since the episode's start."""
         return int(self.simulation.elapsed_steps[0])
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        # One generator draws both for gymnasium and for the simulation.
+        self.np_random = self.simulation.rngs[0]
+
+    def __copy__(self) -> PointGoalEnv:
+        """As `copy.deepcopy`: two environments that share a simulation would drive one robot."""
+        return copy.deepcopy(self)
+
+
+def unlimited(**settings: Any) -> PointGoalEnv:
+    """A `PointGoalEnv` that truncates nothing: gymnasium's own wrapper does, after ``max_episode_steps``."""
+    return PointGoalEnv(**settings, max_episode_steps=None)
 
 
 def _first(rows: FloatArray) -> FloatArray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import mujoco
 import numpy as np
@@ -26,6 +26,8 @@ GOAL_RADIUS = 0.3
 """The goal is met at this distance of the robot's origin [m]."""
 REWARD_LIMIT = 10.0
 """Rewards are clipped to ± this."""
+MOST = 1e4
+"""Largest number of a state that a robot is put into, in metres, radians and seconds."""
 VASE_SPEED_THRESHOLD = 1e-4
 """Level 2: a vase slower than this costs nothing [m/s]."""
 
@@ -85,14 +87,10 @@ class State:
         return State(**{name: array[rows] for name, array in vars(self).items()})
 
     @staticmethod
-    def from_mapping(state: Mapping[str, object], level: int, n: int) -> State:
-        """Check a mapping of arrays and make a state of it.
-
-        Raises:
-            ValueError: naming the field that is missing, unknown, of a wrong shape or not finite.
-        """
+    def shapes(level: int, n: int) -> dict[str, tuple[int, ...]]:
+        """Name → shape of n robots' arrays."""
         h, m = NUM_HAZARDS[level], NUM_VASES[level]
-        shapes = {
+        return {
             "pose": (n, 3),
             "velocity": (n, 3),
             "goal": (n, 2),
@@ -100,6 +98,15 @@ class State:
             "vase_qpos": (n, m, VASE_QPOS),
             "vase_qvel": (n, m, VASE_QVEL),
         }
+
+    @staticmethod
+    def from_mapping(state: Mapping[str, object], level: int, n: int) -> State:
+        """Check a mapping of arrays and make a state of it.
+
+        Raises:
+            ValueError: naming the field that is missing, unknown, of a wrong shape or out of range.
+        """
+        shapes = State.shapes(level, n)
         unknown = sorted(set(state) - set(shapes))
         if unknown:
             raise ValueError(f"state has unknown fields {unknown}; it takes {sorted(shapes)}")
@@ -110,8 +117,9 @@ class State:
             array = np.asarray(state[name], dtype=np.float64)
             if array.shape != shape:
                 raise ValueError(f"state {name!r} has shape {array.shape}, expected {shape}")
-            if not np.isfinite(array).all():
-                raise ValueError(f"state {name!r} is not finite")
+            # Once a number or an acceleration is beyond 1e10, MuJoCo puts everything back to its place.
+            if not (np.abs(array) <= MOST).all():
+                raise ValueError(f"state {name!r} must be finite and within ±{MOST:g}")
             arrays[name] = array
         return State(**arrays)
 
@@ -119,11 +127,24 @@ class State:
 class Simulation:
     """n robots, each in its own surroundings, stepped together on one thread.
 
-    Rows are independent: what a row does depends on its own generator, state and actions alone.
+    Rows are independent: what a row does depends on its own generator, state and actions alone. Copies, by
+    `copy` or `pickle`, go on alike, to the last bit.
+
+    Args:
+        level: 0, 1 or 2.
+        n: how many robots.
+        cost: the cost of a step, in metres or as an indicator.
+        model: the scene; None: the level's own.
+        episode_steps: control steps after which an episode is truncated; None: never.
     """
 
     def __init__(
-        self, level: int, n: int, cost: CostKind = "depth", model: mujoco.MjModel | None = None
+        self,
+        level: int,
+        n: int,
+        cost: CostKind = "depth",
+        model: mujoco.MjModel | None = None,
+        episode_steps: int | None = EPISODE_STEPS,
     ) -> None:
         if cost not in ("depth", "indicator"):
             raise ValueError(f"cost must be 'depth' or 'indicator', got {cost!r}")
@@ -143,6 +164,9 @@ class Simulation:
         self._vase_qpos: FloatArray = self._qpos[:, ROBOT_QPOS:].reshape(n, -1, VASE_QPOS)
         self._vase_qvel: FloatArray = self._qvel[:, ROBOT_QPOS:].reshape(n, -1, VASE_QVEL)
         self.elapsed_steps = np.zeros(n, dtype=np.int64)
+        self.episode_steps = episode_steps
+        # Where each row's episode began, and what it was sent since.
+        self._start = _Start.of(level, n)
         self.rngs = [np.random.default_rng() for _ in range(n)]
         # Everything the lidars see, one column a thing: the goal, the hazards, the vases.
         h, m = NUM_HAZARDS[level], NUM_VASES[level]
@@ -191,8 +215,8 @@ class Simulation:
         cos, sin = np.cos(self._qpos[:, 2:3]), np.sin(self._qpos[:, 2:3])
         return np.stack([cos * dx + sin * dy, cos * dy - sin * dx], axis=-1)
 
-    def reset(self, rows: NDArray[np.intp]) -> None:
-        """Draw a new layout for each of the rows (k,), from its own generator."""
+    def reset(self, rows: NDArray[np.intp], elapsed_steps: NDArray[np.int64] | int = 0) -> None:
+        """Draw a new layout for each of the rows (k,), from its own generator, at those steps of episodes."""
         layouts = [sample_layout(self.rngs[i], self.level) for i in rows]
         k, m = len(rows), NUM_VASES[self.level]
         vase_qpos = np.zeros((k, m, VASE_QPOS))
@@ -209,13 +233,14 @@ class Simulation:
             vase_qpos=vase_qpos,
             vase_qvel=np.zeros((k, m, VASE_QVEL)),
         )
-        self.set_state(rows, state)
+        self.set_state(rows, state, elapsed_steps)
 
     def set_state(
         self, rows: NDArray[np.intp], state: State, elapsed_steps: NDArray[np.int64] | int = 0
     ) -> None:
         """Put rows (k,) into exact states (leading axis k), everything awake, at that step of the episode."""
         k = len(rows)
+        self._start.note(rows, state, elapsed_steps, self.rngs)
         # The reset wakes the vases and clears the solver's warm start: nothing of the old episode is left.
         self.batch.reset(rows, stage=mujoco.mjtStage.mjSTAGE_NONE)
         self._qpos[rows, :ROBOT_QPOS] = state.pose
@@ -238,6 +263,7 @@ class Simulation:
             action: (n, 2) thrust and turning, clipped to ±1.
         """
         np.clip(action, -1.0, 1.0, out=self._ctrl)
+        self._start.log(self._ctrl)
         self.batch.set_models(self._sensorless)
         self.batch.step(nstep=PHYSICS_STEPS)
         self.batch.set_models(None)
@@ -255,7 +281,7 @@ class Simulation:
             dx, dy, distance = self._relative()
         self._goal_distance = distance[:, 0].copy()
         self.elapsed_steps += 1
-        truncated = self.elapsed_steps >= EPISODE_STEPS
+        truncated = self.elapsed_steps >= (np.inf if self.episode_steps is None else self.episode_steps)
         return StepResult(self._encode(dx, dy, distance), reward, cost, terminated, truncated)
 
     def observe(self) -> FloatArray:
@@ -299,49 +325,121 @@ class Simulation:
         return observation
 
     def state_dict(self) -> dict[str, np.ndarray]:
-        """Everything that the future depends on, as arrays with leading axis n.
+        """Everything that the future depends on, as arrays with leading axis n; nothing here is touched.
 
-        A vase's sleep cannot be written back into MuJoCo, so taking the state wakes the vases here, too:
-        this simulation and one that loads the state go on alike, to the last bit.
+        MuJoCo's own state lacks which vases are asleep, and cannot be told. So this is where each episode
+        began and what was sent since: `load_state_dict` drives that again, to the same bits.
         """
-        state = {
-            "physics": self.batch.state.copy(),
-            "x": self._x.copy(),
-            "y": self._y.copy(),
-            "goal_distance": self._goal_distance.copy(),
-            "elapsed_steps": self.elapsed_steps.copy(),
-            "rng": np.array([_pack_rng(rng) for rng in self.rngs], dtype=np.uint64),
-        }
-        self.load_state_dict(state)
-        return state
+        return self._start.state_dict()
+
+    def __getstate__(self) -> dict[str, Any]:
+        made_of = self.level, self.n, self.cost_kind, self.model, self.episode_steps
+        return {"made_of": made_of, "rngs": self.rngs, "state": self.state_dict()}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        level, n, cost, model, episode_steps = state["made_of"]
+        Simulation.__init__(self, level, n, cost, model, episode_steps)
+        self.rngs = list(state["rngs"])
+        self.load_state_dict(state["state"])
 
     def load_state_dict(self, state: Mapping[str, np.ndarray]) -> None:
-        """Go on from a state that `state_dict` gave.
+        """Go on from a state that `state_dict` gave; as long as simulating its longest episode so far.
 
         Raises:
             ValueError: naming the array that is missing or of another shape.
         """
-        shapes = {
-            "physics": self.batch.state.shape,
-            "x": self._x.shape,
-            "y": self._y.shape,
-            "goal_distance": (self.n,),
-            "elapsed_steps": (self.n,),
-            "rng": (self.n, _RNG_WORDS),
-        }
-        for name, shape in shapes.items():
-            if name not in state or state[name].shape != shape:
-                found = state[name].shape if name in state else "nothing"
-                raise ValueError(f"simulation state {name!r}: expected shape {shape}, found {found}")
-        self.batch.reset(stage=mujoco.mjtStage.mjSTAGE_NONE)
-        self.batch.state[...] = state["physics"]
-        self.batch.forward()
-        # The forward pass moves the solver's warm start on; the saved one is what the next step starts from.
-        self.batch.state[...] = state["physics"]
-        self._x[...], self._y[...] = state["x"], state["y"]
-        self._goal_distance = state["goal_distance"].copy()
-        self.elapsed_steps[...] = state["elapsed_steps"]
-        self.rngs = [_unpack_rng(words) for words in state["rng"]]
+        start = _Start.from_state_dict(state, self.level, self.n)
+        self._start = _Start.of(self.level, self.n)
+        longest = int(start.sent.max(initial=0))
+        for step in range(longest + 1):
+            rows = np.flatnonzero(start.begun & (longest - start.sent == step))
+            if len(rows):
+                for row in rows:
+                    self.rngs[row] = _unpack_rng(start.rng[row])
+                self.set_state(rows, start.state.rows(rows), start.elapsed_steps[rows])
+            if step < longest:
+                at = np.maximum(start.sent - longest + step, 0)
+                # Rows that have not begun are set anew when they do.
+                self.step(start.action[np.arange(self.n), at])
+
+
+@dataclass
+class _Start:
+    """How n rows' episodes began, and what they were sent since.
+
+    Attributes:
+        begun: (n,) whether a row has an episode at all.
+        state: the states that they began in.
+        elapsed_steps: (n,) of the episode then.
+        rng: (n, 6) their generators then.
+        action: (n, steps, 2) what was sent, ``sent`` (n,) of them so far.
+    """
+
+    begun: BoolArray
+    state: State
+    elapsed_steps: NDArray[np.int64]
+    rng: NDArray[np.uint64]
+    action: FloatArray
+    sent: NDArray[np.int64]
+
+    @staticmethod
+    def of(level: int, n: int) -> _Start:
+        """Before any episode."""
+        state = State(**{name: np.zeros(shape) for name, shape in State.shapes(level, n).items()})
+        return _Start(
+            begun=np.zeros(n, np.bool_),
+            state=state,
+            elapsed_steps=np.zeros(n, np.int64),
+            rng=np.zeros((n, _RNG_WORDS), np.uint64),
+            action=np.zeros((n, EPISODE_STEPS, 2)),
+            sent=np.zeros(n, np.int64),
+        )
+
+    def note(
+        self,
+        rows: NDArray[np.intp],
+        state: State,
+        elapsed_steps: NDArray[np.int64] | int,
+        rngs: Sequence[np.random.Generator],
+    ) -> None:
+        """New episodes of some rows (k,), in states with leading axis k."""
+        self.begun[rows] = True
+        for name, array in vars(self.state).items():
+            array[rows] = getattr(state, name)
+        self.elapsed_steps[rows] = elapsed_steps
+        self.rng[rows] = [_pack_rng(rngs[row]) for row in rows]
+        self.sent[rows] = 0
+
+    def log(self, action: FloatArray) -> None:
+        """One more step of all rows; (n, 2)."""
+        most = self.action.shape[1]
+        if int(self.sent.max(initial=0)) == most:
+            self.action = np.pad(self.action, ((0, 0), (0, most), (0, 0)))
+        self.action[np.arange(len(action)), self.sent] = action
+        self.sent += 1
+
+    def state_dict(self) -> dict[str, np.ndarray]:
+        """Copies of the arrays."""
+        numbers = {name: array for name, array in vars(self).items() if name != "state"}
+        return {name: array.copy() for name, array in {**numbers, **vars(self.state)}.items()}
+
+    @staticmethod
+    def from_state_dict(state: Mapping[str, np.ndarray], level: int, n: int) -> _Start:
+        """The inverse of `state_dict`, or ValueError."""
+        empty = _Start.of(level, n)
+        found = {}
+        for name, array in empty.state_dict().items():
+            given = state[name].shape if name in state else "nothing"
+            # An episode that goes on and on has room for more.
+            longer = name == "action" and name in state and state[name].ndim == 3
+            shape = (n, state[name].shape[1], 2) if longer else array.shape
+            if given != shape:
+                raise ValueError(f"simulation state {name!r}: expected shape {shape}, found {given}")
+            found[name] = state[name].copy()
+        if not ((found["sent"] >= 0) & (found["sent"] <= found["action"].shape[1])).all():
+            raise ValueError("simulation state 'sent' counts more steps than there are actions")
+        places = State(**{name: found.pop(name) for name in vars(empty.state)})
+        return _Start(state=places, **found)
 
 
 def _pack_rng(rng: np.random.Generator) -> list[int]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import operator
 import os
 from collections.abc import Sequence
@@ -53,6 +54,7 @@ class PointGoalVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
         cost: ``"depth"``, metres inside hazards (the paper's), or ``"indicator"``, 1 if that is above 0.
         num_threads: threads that share the environments; 0 takes one a CPU.
         render_mode: ``"rgb_array"`` or None.
+        max_episode_steps: steps after which an episode is truncated.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012
@@ -68,7 +70,10 @@ class PointGoalVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
         cost: CostKind = "depth",
         num_threads: int = 0,
         render_mode: str | None = None,
+        max_episode_steps: int = EPISODE_STEPS,
     ) -> None:
+        if max_episode_steps < 1:
+            raise ValueError(f"max_episode_steps must be at least 1, got {max_episode_steps}")
         if num_envs < 1:
             raise ValueError(f"num_envs must be at least 1, got {num_envs}")
         if num_threads < 0:
@@ -85,8 +90,11 @@ class PointGoalVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
         bounds = np.linspace(0, num_envs, threads + 1).astype(int)
         self._slices = [slice(a, b) for a, b in pairwise(bounds)]
         model = build_scene(level)
-        self.simulations = [Simulation(level, part.stop - part.start, cost, model) for part in self._slices]
-        self._pool = ThreadPoolExecutor(threads, "pointgoal") if threads > 1 else None
+        self._max_episode_steps = max_episode_steps
+        self.simulations = [
+            Simulation(level, part.stop - part.start, cost, model, max_episode_steps) for part in self._slices
+        ]
+        self._threads, self._threads_of = self._start_threads(), os.getpid()
         self._cost = np.zeros(num_envs)
         self._started = False
 
@@ -125,16 +133,16 @@ class PointGoalVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
         steps = np.zeros(self.num_envs, np.int64)
         if elapsed is not None:
             steps = _rows(elapsed, np.int64, self.num_envs, "elapsed_steps")
-            if not ((steps >= 0) & (steps < EPISODE_STEPS)).all():
-                raise ValueError(f"elapsed_steps must be 0 to {EPISODE_STEPS - 1}, got {steps.tolist()}")
+            if not ((steps >= 0) & (steps < self._max_episode_steps)).all():
+                most = self._max_episode_steps - 1
+                raise ValueError(f"elapsed_steps must be 0 to {most}, got {steps.tolist()}")
         self._seed(seed, chosen)
         for simulation, part in zip(self.simulations, self._slices, strict=True):
             rows = np.flatnonzero(chosen[part])
             if not len(rows):
                 continue
             if whole is None:
-                simulation.reset(rows)
-                simulation.elapsed_steps[rows] = steps[part][rows]
+                simulation.reset(rows, steps[part][rows])
             else:
                 simulation.set_state(rows, whole.rows(part).rows(rows), steps[part][rows])
         self._started = True
@@ -165,10 +173,13 @@ class PointGoalVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
         if not np.isfinite(actions).all():
             raise ValueError("actions are not finite")
         parts = [actions[part] for part in self._slices]
-        if self._pool is None:
+        if self._threads_of != os.getpid():
+            # A fork leaves its threads behind.
+            self._threads, self._threads_of = self._start_threads(), os.getpid()
+        if self._threads is None:
             results = [self.simulations[0].step(parts[0])]
         else:
-            results = list(self._pool.map(Simulation.step, self.simulations, parts))
+            results = list(self._threads.map(Simulation.step, self.simulations, parts))
         result = StepResult.concatenate(results)
         info: dict[str, Any] = {"cost": result.cost}
         done = result.terminated | result.truncated
@@ -194,8 +205,22 @@ class PointGoalVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
 
     def close_extras(self, **kwargs: Any) -> None:
         """Stop the threads."""
-        if self._pool is not None:
-            self._pool.shutdown()
+        if self._threads is not None and self._threads_of == os.getpid():
+            self._threads.shutdown()
+
+    def _start_threads(self) -> ThreadPoolExecutor | None:
+        return ThreadPoolExecutor(len(self._slices), "pointgoal") if len(self._slices) > 1 else None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name != "_threads"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._threads, self._threads_of = self._start_threads(), os.getpid()
+
+    def __copy__(self) -> PointGoalVectorEnv:
+        """As `copy.deepcopy`: two environments that share a simulation would drive one robot."""
+        return copy.deepcopy(self)
 
     @property
     def pose(self) -> FloatArray:

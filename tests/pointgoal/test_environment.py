@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+import os
+import pickle
 import subprocess
 import sys
 import warnings
@@ -185,8 +188,119 @@ def test_a_loaded_state_goes_on_bit_for_bit(level: int) -> None:
     for action in actions[80:]:
         for ours, theirs in zip(env.step(action)[:4], other.step(action)[:4], strict=True):
             np.testing.assert_array_equal(ours, theirs)
-    with pytest.raises(ValueError, match="physics"):
+    with pytest.raises(ValueError, match="begun"):
         PointGoalVectorEnv(level=level, num_envs=n + 1).load_state_dict(state)
+
+
+@pytest.mark.parametrize("level", [1, 2])
+def test_saving_a_state_changes_nothing(level: int) -> None:
+    """Vases fall asleep after some steps: one that is saved on the way must stay so."""
+    saved, plain = (PointGoalVectorEnv(level=level, num_envs=3, num_threads=1) for _ in range(2))
+    for env in (saved, plain):
+        env.reset(seed=4)
+    actions = np.random.default_rng(5).uniform(-1, 1, (150, 3, 2))
+    for step, action in enumerate(actions):
+        if step % 7 == 0:
+            saved.state_dict()
+        for ours, theirs in zip(saved.step(action)[:4], plain.step(action)[:4], strict=True):
+            np.testing.assert_array_equal(ours, theirs)
+        for ours, theirs in zip(saved.simulations, plain.simulations, strict=True):
+            np.testing.assert_array_equal(ours.vases, theirs.vases)
+
+
+def copied(env: Any, way: str) -> Any:
+    return pickle.loads(pickle.dumps(env)) if way == "pickle" else getattr(copy, way)(env)
+
+
+@pytest.mark.parametrize("way", ["copy", "deepcopy", "pickle"])
+def test_a_copy_goes_on_alike_and_by_itself(way: str) -> None:
+    rng = np.random.default_rng(6)
+    env = gymnasium.make("PointGoal1-v0", max_episode_steps=90)
+    env.reset(seed=7)
+    many = PointGoalVectorEnv(level=1, num_envs=5, num_threads=2, max_episode_steps=90)
+    many.reset(seed=7, options={"elapsed_steps": np.arange(5) * 15})
+    for _ in range(50):
+        env.step(rng.uniform(-1, 1, 2))
+        many.step(rng.uniform(-1, 1, (5, 2)))
+    other, others = copied(env.unwrapped, way), copied(many, way)
+    before = other.pose, others.pose
+    actions = rng.uniform(-1, 1, (60, 5, 2))
+    ours = [(env.unwrapped.step(action[0])[:4], many.step(action)[:4]) for action in actions]
+    assert (other.pose == before[0]).all()
+    assert (others.pose == before[1]).all()
+    for action, (alone, side_by_side) in zip(actions, ours, strict=True):
+        for mine, theirs in zip(alone, other.step(action[0])[:4], strict=True):
+            np.testing.assert_array_equal(mine, theirs)
+        for mine, theirs in zip(side_by_side, others.step(action)[:4], strict=True):
+            np.testing.assert_array_equal(mine, theirs)
+    # And the next episode: the generators went along.
+    np.testing.assert_array_equal(env.unwrapped.reset()[0], other.reset()[0])
+    for each in (many, others):
+        each.close()
+
+
+def test_before_its_first_reset_it_can_be_copied_as_well() -> None:
+    for env in (PointGoalEnv(level=0), PointGoalVectorEnv(level=0, num_envs=2)):
+        other = copied(env, "pickle")
+        np.testing.assert_array_equal(env.reset(seed=1)[0], other.reset(seed=1)[0])
+
+
+FORKED = """
+import os, sys
+import numpy as np
+from pointgoal.vector import PointGoalVectorEnv
+env = PointGoalVectorEnv(level=1, num_envs=4, num_threads=2)
+env.reset(seed=0)
+env.step(np.ones((4, 2)))
+read, write = os.pipe()
+child = os.fork()
+observation = env.step(np.ones((4, 2)))[0]
+if child == 0:
+    os.write(write, observation.tobytes())
+    env.close()
+    os._exit(0)
+os.waitpid(child, 0)
+assert os.read(read, 8 * observation.size) == observation.tobytes()
+env.close()
+print("alike")
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+def test_forked_after_a_step_it_goes_on() -> None:
+    command = [sys.executable, "-W", "ignore::DeprecationWarning", "-c", FORKED]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert result.stdout == "alike\n", result.stderr
+
+
+def test_episodes_are_as_long_as_asked_for() -> None:
+    assert gymnasium.make("PointGoal1-v0").spec.max_episode_steps == 1000
+    assert gymnasium.make_vec("PointGoal1-v0", num_envs=2).spec.max_episode_steps == 1000
+    for steps in (5, 1003):
+        env = gymnasium.make("PointGoal0-v0", max_episode_steps=steps)
+        env.reset(seed=0)
+        ended = [env.step(np.zeros(2))[3] for _ in range(steps)]
+        assert ended == [False] * (steps - 1) + [True]
+        many = gymnasium.make_vec("PointGoal0-v0", num_envs=2, max_episode_steps=steps)
+        many.reset(seed=0)
+        ended = [many.step(np.zeros((2, 2)))[3].tolist() for _ in range(steps)]
+        assert ended == [[False] * 2] * (steps - 1) + [[True] * 2]
+    for make in (PointGoalEnv, PointGoalVectorEnv):
+        with pytest.raises(ValueError, match="max_episode_steps must be at least 1, got 0"):
+            make(max_episode_steps=0)
+
+
+@pytest.mark.parametrize("turning", [1e4, -1e4, 0.0])
+def test_the_fastest_states_are_driven_from_and_not_put_back(turning: float) -> None:
+    env = PointGoalEnv(level=1)
+    vase = np.full((1, 6), 1e4)
+    state = exact_state(pose=[3e3, 4e3, 1e4], velocity=[1e4, -1e4, turning], vase_qvel=vase)
+    env.reset(options={"state": state})
+    before = env.pose
+    for _ in range(3):
+        env.step(np.zeros(2))
+        assert 1.0 < np.hypot(*(env.pose - before)[:2]) < 500.0
+        before = env.pose
 
 
 def test_costs() -> None:
@@ -206,7 +320,9 @@ def test_costs() -> None:
         ({"state": {"pose": np.zeros(3)}}, "lacks 'velocity'"),
         ({"state": exact_state() | {"goal": np.zeros(3)}}, r"'goal' has shape \(1, 3\)"),
         ({"state": exact_state() | {"colour": np.zeros(3)}}, "unknown fields"),
-        ({"state": exact_state() | {"pose": np.array([0, np.nan, 0])}}, "'pose' is not finite"),
+        ({"state": exact_state() | {"pose": np.array([0, np.nan, 0])}}, "'pose' must be finite"),
+        ({"state": exact_state(velocity=[1e11, 0.0, 0.0])}, "'velocity' must be finite and within"),
+        ({"state": exact_state(vase_qvel=np.full((1, 6), -2e4))}, "'vase_qvel' must be finite and within"),
         ({"start": 1}, "no options"),
     ],
 )
