@@ -77,7 +77,7 @@ def action_range(config: Config, space: Box) -> ActionRange:
     if not useful:
         return ActionRange(zeros + 1, zeros, space.low.astype(np.float32), space.high.astype(np.float32))
     unit = np.asarray(useful, np.float32)
-    if unit.shape != space.shape or (unit <= 0).any() or (unit > np.minimum(-space.low, space.high)).any():
+    if unit.shape != space.shape or not ((unit > 0) & (unit <= np.minimum(-space.low, space.high))).all():
         raise ConfigError(f"--action-range must give {space.shape[0]} numbers above 0 within {space}")
     dead = zeros + np.asarray(_known(DEAD, config.task) or 0, np.float32)
     if (unit <= dead).any():

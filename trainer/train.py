@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 import signal
 import sys
 from collections.abc import Callable, Iterator
@@ -67,10 +68,14 @@ def make_environments(config: Config) -> Environments:
 
     import pointgoal  # noqa: F401 (registers the tasks when run from a source tree)
 
-    arguments: dict[str, Any] = {"cost": config.cost, "num_threads": config.threads}
+    arguments: dict[str, Any] = {
+        "cost": config.cost,
+        "num_threads": config.threads,
+        "max_episode_steps": config.episode_steps,
+    }
     try:
         return gymnasium.make_vec(config.task, num_envs=config.num_envs, **arguments)
-    except (gymnasium.error.Error, TypeError) as error:
+    except (gymnasium.error.Error, TypeError, ValueError) as error:
         raise ConfigError(f"cannot make the task {config.task!r}: {error}") from error
 
 
@@ -130,6 +135,31 @@ class Run:
             "action_std": float(np.exp(actor[learner.actor_shape.size :]).mean()),
             **logged,
         }
+
+    def found(self) -> None:
+        """Makes the run's folder, whole or not at all: settings, first checkpoint, an empty progress.csv.
+
+        Raises:
+            CheckpointError: if it cannot be made.
+        """
+        folder = self.folder
+        half_made = folder.with_name(f".{folder.name}.part")
+        try:
+            shutil.rmtree(half_made, ignore_errors=True)
+            half_made.mkdir(parents=True)
+            settings = json.dumps(_plain(self.config), indent=2) + "\n"
+            checkpoint.replace(half_made / CONFIG, settings.encode())
+            ProgressFile(half_made).close()
+            self.folder = half_made
+            self.save(0)
+            if folder.exists():
+                folder.rmdir()
+            half_made.rename(folder)
+        except OSError as error:
+            raise CheckpointError(f"cannot make {folder}: {error.strerror}") from error
+        finally:
+            self.folder = folder
+            shutil.rmtree(half_made, ignore_errors=True)
 
     def save(self, written: int) -> None:
         """Writes the checkpoint; `written` is the length of progress.csv that belongs to it [bytes].
@@ -193,13 +223,17 @@ def train(
         TrainerError: with one clear line, whatever goes wrong that the user can act on.
     """
     started = perf_counter()
-    config, folder, resumed = prepare(config)
+    config, folder = prepare(config)
+    resumed = config.resume is not None
     torch.set_num_threads(1)  # jobs run side by side instead, see Learner
     with closing(prepare_environments(config.algorithm, make(config), config.action_repeat)) as env:
         run = Run(config, folder, env)
-        length = run.load() if resumed and (folder / checkpoint.FILE).exists() else 0
-        table = ProgressFile(folder, length)
-        run.save(length)
+        if resumed:
+            table = ProgressFile(folder, run.load())
+        else:
+            # Whatever could be wrong with the settings was tried.
+            run.found()
+            table = ProgressFile(folder)
         with closing(table), closing(Events(folder, config.tensorboard, run.steps)) as events:
             trace = _loop(run, table, events, console or Console(quiet=True), started)
     spent = dict(run.rollout.seconds)
@@ -268,11 +302,11 @@ def _stop_request() -> Iterator[Callable[[], bool]]:
         signal.signal(signal.SIGINT, before)
 
 
-def prepare(config: Config) -> tuple[Config, Path, bool]:
-    """Checks the settings and the run's folder before anything is spent.
+def prepare(config: Config) -> tuple[Config, Path]:
+    """Checks the settings and the run's folder before anything is spent; writes nothing.
 
     Returns:
-        The settings to train with, the folder, and whether a run is continued.
+        The settings to train with, whose `resume` is set if a run is continued, and the folder.
 
     Raises:
         ConfigError: if a setting is at fault.
@@ -281,7 +315,13 @@ def prepare(config: Config) -> tuple[Config, Path, bool]:
     if config.resume is not None:
         if config != Config(resume=config.resume):
             raise ConfigError("--resume takes every setting from the run; give no other flag beside it")
-        return load_config(config.resume), config.resume, True
+        if not (config.resume / checkpoint.FILE).exists():
+            load_config(config.resume)
+            raise CheckpointError(
+                f"{config.resume} holds no {checkpoint.FILE}: there is nothing to go on from; "
+                "what else is in it was left as it is"
+            )
+        return replace(load_config(config.resume), resume=config.resume), config.resume
     check(config)
     if config.out is None:
         raise ConfigError("give the run a folder: --out runs/NAME")
@@ -290,12 +330,7 @@ def prepare(config: Config) -> tuple[Config, Path, bool]:
         raise CheckpointError(
             f"{folder} exists and is not empty: choose another --out, or continue it with --resume {folder}"
         )
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise CheckpointError(f"cannot make {folder}: {error.strerror}") from error
-    checkpoint.replace(folder / CONFIG, (json.dumps(_plain(config), indent=2) + "\n").encode())
-    return config, folder, False
+    return config, folder
 
 
 def _plain(config: Config) -> dict[str, Any]:

@@ -1,8 +1,10 @@
 """Never lost: interruptions of every kind, and runs that go on from them bit for bit."""
 
+import csv
 import errno
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -61,6 +63,102 @@ def test_a_resumed_run_is_the_uninterrupted_one_bit_for_bit(algorithm, tmp_path,
     assert whole.keys() == cut.keys()
     for name in whole:
         np.testing.assert_array_equal(whole[name], cut[name], err_msg=name)
+
+
+def point(out, **settings):
+    """A short run at a level with vases, which fall asleep and have to stay so."""
+    return Config(
+        algorithm="ppo", task="PointGoal1-v0", out=out, num_envs=4, epoch_steps=400, total_steps=4000,
+        minibatch=100, passes=1, threads=1, tensorboard=False, **settings,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def whole_point_run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("point") / "run"
+    train(point(folder, checkpoint_every=100))
+    return folder
+
+
+@pytest.mark.parametrize("stop", [1, 4, 7])
+@pytest.mark.parametrize("every", [3, 100])
+def test_among_vases_it_goes_on_bit_for_bit_wherever_it_was_stopped(
+    whole_point_run, tmp_path, monkeypatch, stop, every
+):
+    """A stop saves beside the grid of checkpoints; so does every checkpoint for a run with another grid."""
+    advance, done = Run.advance, iter(range(1, 100))
+
+    def then_ctrl_c(self):
+        row = advance(self)
+        if next(done) == stop:
+            os.kill(os.getpid(), signal.SIGINT)
+        return row
+
+    monkeypatch.setattr(Run, "advance", then_ctrl_c)
+    assert not train(point(tmp_path / "run", checkpoint_every=every)).finished
+    monkeypatch.undo()
+    assert checkpoint.read(tmp_path / "run")[1]["epoch"] == stop
+    assert train(Config(resume=tmp_path / "run")).finished
+    assert (tmp_path / "run/progress.csv").read_bytes() == (whole_point_run / "progress.csv").read_bytes()
+    whole, there = arrays(whole_point_run)[0], arrays(tmp_path / "run")[0]
+    for name, value in whole.items():
+        np.testing.assert_array_equal(value, there[name], err_msg=name)
+
+
+def test_without_its_checkpoint_a_run_is_not_begun_anew(whole_point_run, tmp_path):
+    folder = shutil.copytree(whole_point_run, tmp_path / "run")
+    (folder / checkpoint.FILE).unlink()
+    before = {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
+    with pytest.raises(CheckpointError, match=rf"holds no {checkpoint.FILE}"):
+        train(Config(resume=folder))
+    assert {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()} == before
+    assert before["progress.csv"]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "named"),
+    [
+        ({"task": "PointGoal7-v0"}, "PointGoal7-v0"),
+        ({"task": "no task"}, "no task"),
+        ({"action_range": (np.nan, 1.0)}, "--action-range"),
+        ({"action_range": (0.05, 2.0)}, "--action-range"),
+        ({"episode_steps": 1001}, "--episode-steps"),
+        ({"cost": "deep"}, "cost"),
+        ({"total_steps": 0}, "--total-steps"),
+    ],
+)
+def test_a_start_that_fails_leaves_nothing_behind(tmp_path, wrong, named):
+    with pytest.raises(ConfigError, match=named):
+        train(replace(point(tmp_path / "new" / "run"), **wrong))
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "run").mkdir()
+    with pytest.raises(ConfigError, match=named):
+        train(replace(point(tmp_path / "run"), **wrong))
+    assert list((tmp_path / "run").iterdir()) == []
+
+
+def test_nor_does_a_disk_that_is_full_at_the_start(tmp_path, tiny_task, monkeypatch):
+    def no_space(folder, arrays, facts):
+        raise CheckpointError("cannot write: No space left")
+
+    monkeypatch.setattr(checkpoint, "write", no_space)
+    with pytest.raises(CheckpointError, match="No space left"):
+        train(tiny("ppo", tmp_path / "run"), lambda c: tiny_task(c.num_envs))
+    assert list(tmp_path.iterdir()) == []
+    monkeypatch.undo()
+    (tmp_path / ".run.part").mkdir()
+    (tmp_path / ".run.part" / "config.json").write_text("{")  # killed while it was being made
+    assert train(tiny("ppo", tmp_path / "run"), lambda c: tiny_task(c.num_envs)).finished
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+@pytest.mark.parametrize("steps", [50, 1500])
+def test_episodes_have_the_length_that_was_asked_for(tmp_path, steps):
+    config = replace(point(tmp_path / "run"), episode_steps=steps, total_steps=8000)
+    train(config)
+    with (tmp_path / "run/progress.csv").open() as file:
+        lengths = {row["length"] for row in csv.DictReader(file)} - {""}
+    assert lengths == {repr(float(steps))}
 
 
 def start(*arguments, **options):

@@ -1,6 +1,8 @@
 """A sweep without Ray: its plan, its locks, its table, and what it does about lost workers."""
 
 import csv
+import dataclasses
+import json
 import signal
 import subprocess
 import sys
@@ -13,13 +15,13 @@ import tyro
 from rich.console import Console
 
 from trainer import checkpoint
+from trainer.config import Config
 from trainer.errors import CheckpointError, ConfigError, NonFiniteError
 from trainer.sweep import Sweep, driver, sweep
 from trainer.sweep.job import Job, Progress, State, write_summary
 from trainer.sweep.settings import FOLDER, is_finished, plan, refuse_other_settings
 from trainer.sweep.table import Board, table
 from trainer.sweep.worker import TOKEN, Outcome, claim, read_holder, work
-from trainer.train import prepare
 
 HEADER = "epoch,steps,episodes,episodes_ended,return,cost,return_100,cost_100,multiplier\n"
 QUIET = Console(quiet=True)
@@ -31,6 +33,14 @@ def small(out: Path, **changes) -> Sweep:
         epoch_steps=1000, num_envs=40, action_repeat=5, tensorboard=False,
     )  # fmt: skip
     return replace(settings, **changes)
+
+
+def begin(config: Config) -> None:
+    """A run that has not got any further than its settings."""
+    config.out.mkdir(parents=True)
+    values = dataclasses.asdict(config)
+    settings = {name: value for name, value in values.items() if name not in {"out", "resume"}}
+    (config.out / "config.json").write_text(json.dumps(settings))
 
 
 def report(folder: Path, rows: int) -> None:
@@ -109,7 +119,7 @@ def test_the_command_line_takes_lists_and_the_trainers_flags_but_not_those_of_on
 
 def test_a_run_that_was_started_with_other_settings_is_not_continued(tmp_path):
     run = plan(small(tmp_path))[0]
-    prepare(run.config)
+    begin(run.config)
     refuse_other_settings(run)
     other = plan(small(tmp_path, total_steps=9000))[0]
     with pytest.raises(ConfigError, match="started with total_steps 4000, not 9000"):
@@ -186,12 +196,10 @@ def test_a_worker_starts_a_run_or_continues_it(shared, monkeypatch):
     monkeypatch.setattr(
         "trainer.train.train", lambda config: given.append(config) or SimpleNamespace(finished=True)
     )
-    run.folder.mkdir()
-    (run.folder / "config.json.part").write_text("{")  # its first worker died here
     assert work(run, "secret", 2, "node") == Outcome(True)
     assert read_holder(run.claim)["attempt"] == 2
     assert given[-1] == run.config
-    prepare(run.config)
+    begin(run.config)
     work(run, "secret", 3, "node")
     assert given[-1].resume == run.folder
 
@@ -393,7 +401,7 @@ def test_finished_runs_need_no_ray_and_damaged_ones_are_told_apart(tmp_path, mon
     settings = small(tmp_path, seeds=(3,), cost_limits=(0.5,))
     ppo, lagnet = plan(settings)
     for run in (ppo, lagnet):
-        prepare(run.config)
+        begin(run.config)
         report(run.folder, 4)
         checkpoint.write(run.folder, {}, {"epoch": 4})
     assert {job.state for job in sweep(settings, QUIET)} == {State.FINISHED}

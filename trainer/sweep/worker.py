@@ -62,9 +62,6 @@ def work(run: SweptRun, token: str, attempt: int, node: str) -> Outcome:
 def _settings(run: SweptRun) -> Config:
     if (run.folder / CONFIG).exists():
         return Config(resume=run.folder)
-    # A worker that died before the settings were complete leaves nothing worth keeping, and the trainer
-    # starts only in an empty folder.
-    (run.folder / f"{CONFIG}.part").unlink(missing_ok=True)
     return run.config
 
 
