@@ -26,7 +26,7 @@ from guide import DEFAULT_STRENGTH, STRENGTHS, Guide, Strength
 from pointgoal import seeds
 from pointgoal.lidar import encode, nearest
 from pointgoal.loop import drive
-from pointgoal.observation import HAZARD_RADIUS, LIDAR_RANGE, layout
+from pointgoal.observation import HAZARD_RADIUS, LIDAR_BINS, LIDAR_RANGE, layout
 from pointgoal.seeds import Use
 
 FloatArray = NDArray[np.float64]
@@ -47,6 +47,8 @@ class Off:
         bearing: bound on the error of its bearing [rad].
         speed: bound on the relative error of the measured velocities.
         gaussian: whether the bounds are standard deviations of normal errors instead.
+        bin: what is wrong with one bin of each robot's hazard lidar: it shows nothing, half of what it
+            should, or always 0.3.
     """
 
     mass: float = 1.0
@@ -57,6 +59,7 @@ class Off:
     bearing: float = 0.0
     speed: float = 0.0
     gaussian: bool = False
+    bin: Literal["", "dead", "half", "stuck"] = ""
 
 
 @dataclass(frozen=True)
@@ -195,6 +198,15 @@ def _perturbed(
     return observation, shown
 
 
+def _with_faults(observation: FloatArray, off: Off, faulty: NDArray[np.bool_]) -> FloatArray:
+    """Observations (N, 60) with the bins (N, 16) that are marked as faulty as they are."""
+    observation = observation.copy()
+    readings = observation[:, layout(1).slice("hazards_lidar")]
+    wrong = {"dead": 0.0, "half": 0.5 * readings, "stuck": 0.3}[off.bin]
+    readings[:] = np.where(faulty, wrong, readings)
+    return observation
+
+
 def run(line: Line, episodes: int, seed: int = 0, chunk: int = 512) -> Outcome:
     """Run the episodes of one line."""
     rows, rng = seeds.rows(Use.FILTER, seed, episodes), seeds.generator(Use.FILTER, seed)
@@ -224,12 +236,17 @@ def _run(line: Line, rows: list[int], rng: np.random.Generator) -> Outcome:
     memory = np.zeros(n, MEMORY)
     off = world.off[0]
     noisy = off.distance + off.bearing + off.speed > 0.0
+    faulty = np.zeros((n, LIDAR_BINS), np.bool_)
+    if off.bin:
+        faulty[np.arange(n), rng.integers(0, LIDAR_BINS, n)] = True
     decided: Decisions | None = None
 
     def act(observation: FloatArray, env: Any) -> FloatArray:
         nonlocal memory, decided, spent
         hazards = env.hazards_in_body_frame()
         seen, shown = _perturbed(observation, hazards, off, rng) if noisy else (observation, hazards)
+        if off.bin:
+            seen = _with_faults(seen, off, faulty)
         action = np.clip(policy(seen, shown, rng), -1.0, 1.0)
         if line.gate == "none":
             return action
@@ -304,6 +321,9 @@ WORLDS = {
     "margin 3 mm": World(FilterConfig(margin=0.003)),
     "margin 2 cm": World(FilterConfig(margin=0.02)),
     "margin 4 cm": World(FilterConfig(margin=0.04)),
+    "a dead bin": World(off=(Off(bin="dead"),)),
+    "a bin at half": World(off=(Off(bin="half"),)),
+    "a stuck bin": World(off=(Off(bin="stuck"),)),
     "ready for noise": World(NOISY),
     "ready for a robot off": World(ROBUST),
 }
@@ -327,7 +347,11 @@ def lines() -> Iterator[Line]:
         yield Line(policy, "plain", "given", "none", "off")
     for policy, source in itertools.product((REWARD_ONLY, "attacker"), SOURCES):
         yield Line(policy, "plain", source, "always", DEFAULT_STRENGTH, memory=False)
-    for world, source in itertools.product(list(WORLDS)[5:], SOURCES):
+    for world in ("a dead bin", "a bin at half", "a stuck bin"):
+        for gate, policy in itertools.product(GATES[:2], (REWARD_ONLY, "attacker")):
+            yield Line(policy, world, "lidar", gate, DEFAULT_STRENGTH)
+    settings = ("margin 3 mm", "margin 2 cm", "margin 4 cm", "ready for noise", "ready for a robot off")
+    for world, source in itertools.product(settings, SOURCES):
         yield Line(REWARD_ONLY, world, source, "always", DEFAULT_STRENGTH)
 
 
