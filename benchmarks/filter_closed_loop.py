@@ -202,8 +202,8 @@ def _with_faults(observation: FloatArray, off: Off, faulty: NDArray[np.bool_]) -
     """Observations (N, 60) with the bins (N, 16) that are marked as faulty as they are."""
     observation = observation.copy()
     readings = observation[:, layout(1).slice("hazards_lidar")]
-    wrong = {"dead": 0.0, "half": 0.5 * readings, "stuck": 0.3}[off.bin]
-    readings[:] = np.where(faulty, wrong, readings)
+    factor, level = {"dead": (0.0, 0.0), "half": (0.5, 0.0), "stuck": (0.0, 0.3)}[off.bin]
+    readings[faulty] = factor * readings[faulty] + level
     return observation
 
 
@@ -347,9 +347,9 @@ def lines() -> Iterator[Line]:
         yield Line(policy, "plain", "given", "none", "off")
     for policy, source in itertools.product((REWARD_ONLY, "attacker"), SOURCES):
         yield Line(policy, "plain", source, "always", DEFAULT_STRENGTH, memory=False)
-    for world in ("a dead bin", "a bin at half", "a stuck bin"):
-        for gate, policy in itertools.product(GATES[:2], (REWARD_ONLY, "attacker")):
-            yield Line(policy, world, "lidar", gate, DEFAULT_STRENGTH)
+    faulty = ("a dead bin", "a bin at half", "a stuck bin")
+    for world, gate, policy in itertools.product(faulty, GATES[:2], (REWARD_ONLY, "attacker")):
+        yield Line(policy, world, "lidar", gate, DEFAULT_STRENGTH)
     settings = ("margin 3 mm", "margin 2 cm", "margin 4 cm", "ready for noise", "ready for a robot off")
     for world, source in itertools.product(settings, SOURCES):
         yield Line(REWARD_ONLY, world, source, "always", DEFAULT_STRENGTH)
