@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import signal
-import sys
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ import numpy as np
 import tyro
 from rich.console import Console
 
+from command import command, settings, terminal
 from evaluation.closed_loop import Episodes, HazardSource, run_episodes
 from evaluation.errors import EvaluateError, ServiceError, ServiceGoneError
 from evaluation.pictures import Drive, animate, draw_drives, drive
@@ -77,7 +77,7 @@ def run_demo(config: DemoConfig, console: Console) -> None:
     bundle = Bundle.load(config.bundle)
     config.out.mkdir(parents=True, exist_ok=True)
     console.print(
-        f"[bold]{bundle.id}[/] on {bundle.manifest.task}, through POST /act, {config.episodes} robots at once"
+        f"{bundle.id} on {bundle.manifest.task}, through POST /act, {config.episodes} robots at once"
     )
     runs = {gate: _drive_through(gate, bundle, config, console) for gate in GATES}
     title = f"{config.episodes} episodes, hazards {_HAZARDS[config.hazards]}, over HTTP"
@@ -103,7 +103,7 @@ def show(
     figures = {gate: summary.to_json() for gate, summary in summaries.items()}
     (out / "summary.json").write_text(json.dumps(figures, indent=2, allow_nan=False) + "\n", encoding="utf-8")
     with (out / "table.txt").open("w", encoding="utf-8") as file:
-        Console(file=file, width=TABLE_WIDTH).print(table)
+        terminal(stderr=False, file=file, width=TABLE_WIDTH).print(table)
     shown = choose_episode(runs["off"], runs["always"])
     drives: dict[str, Drive] = {
         gate: drive(episodes.trajectory, shown) for gate, episodes in runs.items() if episodes.trajectory
@@ -154,22 +154,10 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
 
 def main() -> None:
     """Entry point of `python -m evaluation.demo`."""
-    config = tyro.cli(DemoConfig, prog="python -m evaluation.demo")
     signal.signal(signal.SIGTERM, _interrupt)
-    try:
-        run_demo(config, table_console())
-    except (EvaluateError, BundleError, ServiceError, OSError) as error:
-        _complain(error)
-        sys.exit(2)
-    except ServiceGoneError as error:
-        _complain(error)
-        sys.exit(1)
-    except KeyboardInterrupt:
-        sys.exit(130)
-
-
-def _complain(error: Exception) -> None:
-    Console(stderr=True).print(f"demo: {error}", style="red", markup=False, soft_wrap=True)
+    expected = EvaluateError, BundleError, ServiceError, OSError
+    with command("demo", *expected), command("demo", ServiceGoneError, status=1):
+        run_demo(settings(DemoConfig, "python -m evaluation.demo"), table_console())
 
 
 if __name__ == "__main__":

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -15,6 +14,7 @@ from typing import Annotated, Any, Literal
 import tyro
 from rich.console import Console
 
+from command import command, settings, why_not_file
 from decision import BatchDecider
 from evaluation.closed_loop import Episodes, HazardSource, TaskError, run_episodes
 from evaluation.errors import EvaluateError, ServiceError, ServiceGoneError
@@ -84,8 +84,8 @@ def evaluate(config: EvaluateConfig, console: Console) -> tuple[Runs, dict[str, 
         raise EvaluateError("--episodes must be at least 1 and --seed at least 0")
     if not (math.isfinite(config.timeout) and config.timeout > 0.0):
         raise EvaluateError(f"--timeout must be finite and positive, got {config.timeout}")
-    if config.json is not None and not config.json.parent.is_dir():
-        raise EvaluateError(f"--json {config.json}: there is no folder {config.json.parent}")
+    if config.json is not None and (why := why_not_file(config.json)):
+        raise EvaluateError(f"--json {config.json}: {why}")
     bundle = Bundle.load(config.bundle)
     task = config.task or bundle.manifest.task
     sources: tuple[HazardSource, ...] = ("lidar", "given") if config.hazards == "both" else (config.hazards,)
@@ -164,29 +164,18 @@ def main() -> None:
 
     Exit status 0; 1 if the service failed on the way; 2 if nothing could be run as asked.
     """
-    config = tyro.cli(EvaluateConfig, prog="lagnet-evaluate")
-    console = table_console()
-    try:
+    expected = EvaluateError, TaskError, BundleError, MonitorError, ServiceError
+    with command("lagnet-evaluate", *expected), command("lagnet-evaluate", ServiceGoneError, status=1):
+        config = settings(EvaluateConfig, "lagnet-evaluate")
+        console = table_console()
         runs, who = evaluate(config, console)
         summaries = {_LABELS[source]: summarise(episodes) for source, episodes in runs.items()}
         console.print(tables(_title(config, who), summaries))
         for label, summary in summaries.items():
             for reason, count in summary.reasons.items():
-                console.print(f"{label}: fallback × {count}: {reason}", markup=False)
+                console.print(f"{label}: fallback × {count}: {reason}")
         if config.json is not None:
             write_json(config.json, config, who, runs)
-    except (EvaluateError, TaskError, BundleError, MonitorError, ServiceError) as error:
-        _complain(error)
-        sys.exit(2)
-    except ServiceGoneError as error:
-        _complain(error)
-        sys.exit(1)
-    except KeyboardInterrupt:
-        sys.exit(130)
-
-
-def _complain(error: Exception) -> None:
-    Console(stderr=True).print(f"lagnet-evaluate: {error}", style="red", markup=False, soft_wrap=True)
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ from rich import box
 from rich.console import Console, Group
 from rich.table import Table
 
+from command import terminal
 from decision import OpenedBy, Origin
 from evaluation.statistics import Summary
 
@@ -35,7 +36,8 @@ _ORIGINS = {
 
 def table_console() -> Console:
     """Where tables are printed: as wide as the terminal, or `TABLE_WIDTH` where there is none."""
-    return Console(width=None if sys.stdout.isatty() else TABLE_WIDTH)
+    width = None if sys.stdout.isatty() else TABLE_WIDTH
+    return terminal(stderr=False, width=width)
 
 
 def tables(title: str, summaries: Mapping[str, Summary]) -> Group:

@@ -1,7 +1,7 @@
 """The bundle: what export writes and the runtime reads (policy.onnx, multiplier.onnx, manifest.json)."""
 
-from models.bundle import Bundle, write_bundle
+from models.bundle import Bundle, check_target, write_bundle
 from models.errors import BundleError
 from models.manifest import Manifest, ObservationBlock
 
-__all__ = ["Bundle", "BundleError", "Manifest", "ObservationBlock", "write_bundle"]
+__all__ = ["Bundle", "BundleError", "Manifest", "ObservationBlock", "check_target", "write_bundle"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 import shutil
 import tempfile
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from pydantic import ValidationError
 from models.errors import BundleError
 from models.graph import FLOAT, Graph, Tensor, check_graph, read_graph
 from models.join import join
-from models.manifest import FORMAT_VERSION, MANIFEST_FILE, MULTIPLIER_FILE, POLICY_FILE, Manifest
+from models.manifest import FORMAT_VERSION, MANIFEST_FILE, MULTIPLIER_FILE, NAME, POLICY_FILE, Manifest
 
 
 @dataclass(frozen=True)
@@ -103,7 +104,7 @@ def write_bundle(path: str | Path, policy_onnx: bytes, multiplier_onnx: bytes, m
         BundleError: if the place is taken or cannot be written, or the bundle would not load.
     """
     target = Path(path)
-    _check_replaceable(target)
+    check_target(target)
     digests = {POLICY_FILE: _digest(policy_onnx), MULTIPLIER_FILE: _digest(multiplier_onnx)}
     complete = manifest.model_dump() | {"sha256": digests}
     try:
@@ -124,8 +125,20 @@ def write_bundle(path: str | Path, policy_onnx: bytes, multiplier_onnx: bytes, m
     return Bundle.load(target)
 
 
-def _check_replaceable(target: Path) -> None:
-    """What is not part of a bundle would be lost with the folder that it lies in."""
+def check_target(target: Path) -> None:
+    """Refuses a place where no bundle can be written, before there is one to write.
+
+    What is not part of a bundle would be lost with the folder that it lies in.
+
+    Raises:
+        BundleError: if its name is none for a bundle, or the place is taken by anything else.
+    """
+    name = target.resolve().name
+    if re.fullmatch(NAME, name) is None:
+        raise BundleError(
+            f"{target}: {name!r} is no name for a bundle: expected letters, digits, dots, dashes and "
+            "underscores, at most 64, a letter or a digit first"
+        )
     if not target.exists():
         return
     if not (target / MANIFEST_FILE).is_file():

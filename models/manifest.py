@@ -13,6 +13,9 @@ POLICY_FILE = "policy.onnx"
 MULTIPLIER_FILE = "multiplier.onnx"
 MANIFEST_FILE = "manifest.json"
 
+NAME = r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}"
+"""What a bundle may be called."""
+
 Positive = Annotated[int, Field(ge=1)]
 Pair = tuple[float, float]
 
@@ -65,7 +68,7 @@ class Manifest(_Strict):
     """
 
     format_version: Literal[1] = FORMAT_VERSION
-    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
+    name: Annotated[str, Field(pattern=f"^{NAME}$")]
     created: AwareDatetime
     task: Annotated[str, Field(min_length=1)]
     level: Annotated[int, Field(ge=0, le=2)]

@@ -16,9 +16,9 @@ from typing import Annotated
 
 import tyro
 import uvicorn
-from rich.console import Console
 from starlette.types import ASGIApp
 
+from command import command, settings
 from models import BundleError
 from monitor import DEFAULT_STRENGTH, GateName, Monitor, MonitorError, Strength
 from server.app import MAX_BODY, Lifecycle, create_app
@@ -195,14 +195,8 @@ def _server(app: ASGIApp, lifecycle: Lifecycle, config: ServeConfig, announcemen
 
 def main() -> None:
     """Entry point of `lagnet-serve`: exit status 0 after an orderly stop, 2 if it could not start."""
-    config = tyro.cli(ServeConfig, prog="lagnet-serve")
-    try:
-        serve(config)
-    except (ServeError, BundleError, MonitorError) as error:
-        Console(stderr=True).print(f"lagnet-serve: {error}", style="red", markup=False, soft_wrap=True)
-        sys.exit(2)
-    except KeyboardInterrupt:
-        sys.exit(130)
+    with command("lagnet-serve", ServeError, BundleError, MonitorError):
+        serve(settings(ServeConfig, "lagnet-serve"))
 
 
 if __name__ == "__main__":

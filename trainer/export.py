@@ -1,8 +1,6 @@
 """`lagnet-export`: turns a run into a bundle, after checking that both compute the same."""
 
 import dataclasses
-import re
-import sys
 from contextlib import closing
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -16,9 +14,9 @@ import numpy.typing as npt
 import onnxruntime
 import torch
 import tyro
-from rich.console import Console
 
-from models import BundleError, Manifest, ObservationBlock, write_bundle
+from command import command, settings, terminal, why_not_folder
+from models import BundleError, Manifest, ObservationBlock, check_target, write_bundle
 from pointgoal import seeds
 from pointgoal.observation import HAZARD_RADIUS, layout
 from pointgoal.scene import build_scene, robot_constants
@@ -32,7 +30,7 @@ from trainer.closed_loop import Episodes, episodes
 from trainer.errors import CheckpointError, ExportError, TrainerError
 from trainer.learner import Learner
 from trainer.networks import mlp
-from trainer.train import below, load_config, make_environments
+from trainer.train import below, level_of, load_config, make_environments, why_not_exported
 
 TOLERANCE = 1e-5
 """Largest difference between torch and onnxruntime; relative to the value where that is above 1."""
@@ -59,6 +57,8 @@ class ExportConfig:
     """Deterministic closed-loop episodes that give the bundle its figures and its threshold."""
     threads: int = 2
     """Threads for physics."""
+    replace: bool = False
+    """Whether a bundle that is there already is replaced."""
 
 
 class TrainedRun:
@@ -153,6 +153,11 @@ def export(config: ExportConfig) -> Manifest:
         BundleError: if the bundle cannot be written.
     """
     torch.set_num_threads(1)
+    if config.episodes < 1 or config.threads < 1:
+        raise ExportError(
+            f"--episodes and --threads must be at least 1, not {config.episodes} and {config.threads}"
+        )
+    _check_target(config)
     run = TrainedRun(config.run)
     level = _level(run)
     policy, multiplier = run.graphs()
@@ -237,18 +242,19 @@ def compare(run: TrainedRun, policy: bytes, multiplier: bytes, observation: Floa
     return found
 
 
+def _check_target(config: ExportConfig) -> None:
+    """Refuses what could not be written after all, before anything is spent."""
+    check_target(config.bundle)
+    if why := why_not_folder(config.bundle):
+        raise ExportError(f"{config.bundle}: {why}")
+    if config.bundle.exists() and not config.replace:
+        raise ExportError(f"{config.bundle}: there is a bundle already; --replace replaces it")
+
+
 def _level(run: TrainedRun) -> int:
-    match = re.fullmatch(r"PointGoal(\d)-v\d+", run.config.task)
-    if match is None:
-        raise ExportError(f"a bundle is for a PointGoal task, not {run.config.task}")
-    level = int(match[1])
-    size = len(run.learner.features.normaliser.mean)
-    if size != layout(level).size:
-        raise ExportError(
-            f"{run.config.algorithm} observes more than the robot's sensors give "
-            f"({size} numbers, not {layout(level).size}): it cannot be exported"
-        )
-    return level
+    if why := why_not_exported(run.config):
+        raise ExportError(why)
+    return level_of(run.config.task)
 
 
 def _threshold(run: TrainedRun, played: Episodes) -> Threshold:
@@ -271,19 +277,16 @@ def _figures(played: Episodes) -> dict[str, Any]:
 
 def main() -> None:
     """Console script `lagnet-export`."""
-    console = Console(stderr=True, highlight=False, soft_wrap=True)
-    config = tyro.cli(ExportConfig, description=ExportConfig.__doc__)
-    try:
+    with command("lagnet-export", TrainerError, BundleError, status=1):
+        config = settings(ExportConfig, "lagnet-export")
         manifest = export(config)
-    except (TrainerError, BundleError) as error:
-        console.print(f"[red]lagnet-export:[/red] {error}")
-        sys.exit(1)
-    figures = manifest.figures
-    console.print(
-        f"{config.bundle}: return {figures['return']:.2f}, cost {figures['cost']:.3f} "
-        f"over {figures['episodes']:.0f} episodes"
-    )
-    console.print(f"threshold {manifest.threshold:.4g} ({manifest.threshold_source})")
+        console = terminal()
+        figures = manifest.figures
+        console.print(
+            f"{config.bundle}: return {figures['return']:.2f}, cost {figures['cost']:.3f} "
+            f"over {figures['episodes']:.0f} episodes"
+        )
+        console.print(f"threshold {manifest.threshold:.4g} ({manifest.threshold_source})")
 
 
 if __name__ == "__main__":

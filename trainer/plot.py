@@ -1,7 +1,6 @@
 """`lagnet-plot`: learning curves out of progress.csv alone, laid out as in the paper's figures 3 and 4."""
 
 import itertools
-import sys
 import textwrap
 from collections import defaultdict
 from collections.abc import Sequence
@@ -17,9 +16,9 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, MaxNLocator, NullLocator, StrMethodFormatter
-from rich.console import Console
 from tyro.conf import Positional
 
+from command import command, settings, terminal, why_not_file
 from trainer.curves import Curves, read_curves
 from trainer.errors import CheckpointError, ConfigError, TrainerError
 from trainer.report import FILE
@@ -372,6 +371,16 @@ def _caption(runs: Sequence[Curves], band: Band) -> str:
     )
 
 
+def check_output(path: Path, dpi: int) -> None:
+    """Refuses what no picture can be written to; errors as for `save`."""
+    if path.suffix.lower() not in SUFFIXES:
+        raise ConfigError(f"--out {path} must end in one of {', '.join(SUFFIXES)}")
+    if dpi < 1:
+        raise ConfigError(f"--dpi must be above 0, not {dpi}")
+    if why := why_not_file(path):
+        raise CheckpointError(f"cannot write {path}: {why}")
+
+
 def save(figure: Figure, path: Path, dpi: int = 200) -> None:
     """Writes the picture.
 
@@ -379,10 +388,7 @@ def save(figure: Figure, path: Path, dpi: int = 200) -> None:
         ConfigError: if the ending is none of .png, .pdf, .svg, or the resolution is not above 0.
         CheckpointError: if the file cannot be written.
     """
-    if path.suffix.lower() not in SUFFIXES:
-        raise ConfigError(f"--out {path} must end in one of {', '.join(SUFFIXES)}")
-    if dpi < 1:
-        raise ConfigError(f"--dpi must be above 0, not {dpi}")
+    check_output(path, dpi)
     try:
         with rc_context(_FONT):
             figure.savefig(path, dpi=dpi)
@@ -392,15 +398,12 @@ def save(figure: Figure, path: Path, dpi: int = 200) -> None:
 
 def main() -> None:
     """Console script `lagnet-plot`."""
-    console = Console(stderr=True)
-    settings = tyro.cli(Plot)
-    try:
-        runs = find_runs(settings.folders)
-        save(draw(runs, settings.band, settings.scale), settings.out, settings.dpi)
-    except TrainerError as error:
-        console.print(f"[red]lagnet-plot:[/red] {error}", highlight=False, soft_wrap=True)
-        sys.exit(1)
-    console.print(f"{len(runs)} runs: {settings.out}", highlight=False, soft_wrap=True)
+    with command("lagnet-plot", TrainerError, status=1):
+        chosen = settings(Plot, "lagnet-plot")
+        check_output(chosen.out, chosen.dpi)
+        runs = find_runs(chosen.folders)
+        save(draw(runs, chosen.band, chosen.scale), chosen.out, chosen.dpi)
+        terminal().print(f"{len(runs)} runs: {chosen.out}")
 
 
 if __name__ == "__main__":

@@ -102,16 +102,25 @@ class Events:
             self._writer.close()
 
 
+_BAR, _TIME = 16, 9
+"""Columns of a terminal that the bar takes, and the time that remains."""
+
+
 class Bar:
-    """The progress bar: return, cost, λ and steps a second."""
+    """Shows how a run gets on: a bar on a terminal, elsewhere one line an epoch.
+
+    Both give return, cost, λ and steps a second, as many of them as there is room for.
+    """
 
     def __init__(self, total_steps: int, done: int, console: Console) -> None:
+        self._console = console
+        self._total = total_steps
         self._bar = Progress(
-            BarColumn(bar_width=24),
-            TextColumn("{task.completed:,}/{task.total:,} steps"),
-            TextColumn("{task.fields[figures]}"),
-            TimeRemainingColumn(),
+            TimeRemainingColumn(compact=True),
+            BarColumn(bar_width=_BAR),
+            TextColumn("{task.fields[figures]}", markup=False),
             console=console,
+            disable=not console.is_terminal,
         )
         self._task = self._bar.add_task("train", total=total_steps, completed=done, figures="")
 
@@ -125,11 +134,15 @@ class Bar:
         self._bar.stop()
 
     def show(self, steps: int, row: Row, rate: float) -> None:
-        """Moves the bar on."""
-        figures = " · ".join(
-            f"{label} {value:.2f}" if isinstance(value, float) else f"{label} –"
-            for label, value in (
-                ("return", row["return_100"]), ("cost", row["cost_100"]), ("λ", row["multiplier"])
-            )
-        )  # fmt: skip
-        self._bar.update(self._task, completed=steps, figures=f"{figures} · {rate:,.0f} steps/s")
+        """Moves on by an epoch."""
+        parts = [f"{steps:,}/{self._total:,} steps"]
+        for label, name in (("return", "return_100"), ("cost", "cost_100"), ("λ", "multiplier")):
+            value = row[name]
+            parts.append(f"{label} {value:.2f}" if isinstance(value, float) else f"{label} –")
+        parts.append(f"{rate:,.0f} steps/s")
+        if not self._console.is_terminal:
+            self._console.print(" · ".join(parts))
+            return
+        while len(parts) > 1 and len(" · ".join(parts)) > self._console.width - _BAR - _TIME:
+            parts.pop()
+        self._bar.update(self._task, completed=steps, figures=" · ".join(parts))

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import shutil
 import signal
 import sys
@@ -15,12 +16,12 @@ from typing import Any
 
 import numpy as np
 import torch
-import tyro
 from gymnasium import Space
 from gymnasium.spaces import Box
 from gymnasium.vector import VectorEnv
 from rich.console import Console
 
+from command import INTERRUPTED, command, hint, settings, terminal
 from pointgoal import seeds
 from pointgoal.seeds import Use
 from trainer import checkpoint
@@ -226,6 +227,9 @@ def train(
     config, folder = prepare(config)
     resumed = config.resume is not None
     torch.set_num_threads(1)  # jobs run side by side instead, see Learner
+    said = console or Console(quiet=True)
+    if why := why_not_exported(config):
+        said.print(f"note: {why}")
     with closing(prepare_environments(config.algorithm, make(config), config.action_repeat)) as env:
         run = Run(config, folder, env)
         if resumed:
@@ -235,7 +239,7 @@ def train(
             run.found()
             table = ProgressFile(folder)
         with closing(table), closing(Events(folder, config.tensorboard, run.steps)) as events:
-            trace = _loop(run, table, events, console or Console(quiet=True), started)
+            trace = _loop(run, table, events, said, started)
     spent = dict(run.rollout.seconds)
     spent["total"] = perf_counter() - started
     figures = run.rollout.figures
@@ -358,26 +362,50 @@ def load_config(folder: Path) -> Config:
     return config
 
 
+def level_of(task: str) -> int:
+    """The level of a PointGoal task.
+
+    Raises:
+        ConfigError: if it is another task.
+    """
+    match = re.fullmatch(r"PointGoal(\d)-v\d+", task)
+    if match is None:
+        raise ConfigError(f"a bundle is for a PointGoal task, not {task}")
+    return int(match[1])
+
+
+def why_not_exported(config: Config) -> str | None:
+    """Why no bundle can be made of what these settings train, or None."""
+    try:
+        level_of(config.task)
+    except ConfigError as error:
+        return str(error)
+    if config.algorithm == "scpo":
+        return "scpo observes more than the robot's sensors give: it cannot be exported"
+    return None
+
+
 def main() -> None:
     """Console script `lagnet-train`."""
-    console = Console(stderr=True)
-    config = tyro.cli(Config, description=Config.__doc__)
-    try:
+    with command("lagnet-train", TrainerError, status=1):
+        config = settings(Config, "lagnet-train")
+        console = terminal()
         summary = train(config, console=console)
-    except TrainerError as error:
-        console.print(f"[red]lagnet-train:[/red] {error}", highlight=False, soft_wrap=True)
-        sys.exit(1)
-    done = "finished" if summary.finished else "stopped"
-    rate = f"{summary.steps / summary.seconds['total']:,.0f}" if not config.resume else "–"
-    console.print(f"{done} after {summary.steps:,} steps ({rate} steps/s): {summary.folder}", highlight=False)
-    next_command = (
-        f"lagnet-export {summary.folder} models/{summary.folder.name}"
-        if summary.finished
-        else f"lagnet-train --resume {summary.folder}"
-    )
-    console.print(f"go on with: {next_command}", highlight=False, soft_wrap=True)
-    if not summary.finished:
-        sys.exit(130)
+        done = "finished" if summary.finished else "stopped"
+        rate = f"{summary.steps / summary.seconds['total']:,.0f}" if not config.resume else "–"
+        console.print(f"{done} after {summary.steps:,} steps ({rate} steps/s): {summary.folder}")
+        if not summary.finished:
+            console.print(f"go on with: {hint('lagnet-train', '--resume', summary.folder)}")
+            sys.exit(INTERRUPTED)
+        if why_not_exported(load_config(summary.folder)) is None:
+            bundle = Path("models") / bundle_name(summary.folder)
+            console.print(f"go on with: {hint('lagnet-export', summary.folder, bundle)}")
+
+
+def bundle_name(run: Path) -> str:
+    """A name that a bundle may have for a run's folder: its own, with a dash for what none may hold."""
+    name = re.sub(r"[^A-Za-z0-9._-]+", "-", run.resolve().name).lstrip("._-")[:64]
+    return name or "bundle"
 
 
 if __name__ == "__main__":

@@ -2,7 +2,6 @@
 
 import logging
 import os
-import shlex
 import socket
 import sys
 import time
@@ -12,9 +11,9 @@ from pathlib import Path
 from secrets import token_hex
 from typing import Any
 
-import tyro
 from rich.console import Console
 
+from command import command, complain, hint, settings, terminal
 from trainer import checkpoint
 from trainer.errors import CheckpointError, ConfigError, TrainerError
 from trainer.sweep.job import SUMMARY, Job, State, write_summary
@@ -237,31 +236,27 @@ class Driver:
 
 def main() -> None:
     """Console script `lagnet-sweep`."""
-    console = Console(stderr=True)
-    settings = tyro.cli(Sweep)
-    try:
-        jobs = sweep(settings, console)
-    except TrainerError as error:
-        console.print(f"[red]lagnet-sweep:[/red] {error}", highlight=False, soft_wrap=True)
-        sys.exit(1)
-    except KeyboardInterrupt:
-        console.print("stopped before anything began")
-        sys.exit(130)
-    sys.exit(_report(settings.out, jobs, console))
+    with command("lagnet-sweep", TrainerError, status=1):
+        console = terminal()
+        chosen = settings(Sweep, "lagnet-sweep")
+        try:
+            jobs = sweep(chosen, console)
+        except KeyboardInterrupt:
+            console.print("stopped before anything began")
+            raise
+        sys.exit(_report(chosen.out, jobs, console))
 
 
 def _report(folder: Path, jobs: Sequence[Job], console: Console) -> int:
     """Says how the sweep ended; returns the exit code: 0 all finished, 130 stopped, 1 something failed."""
     for job in jobs:
         if job.error is not None:
-            console.print(f"[red]{job.run.name}:[/red] {job.error}", highlight=False, soft_wrap=True)
+            complain(job.run.name, job.error)
     states = [job.state for job in jobs]
-    say = {"highlight": False, "soft_wrap": True}
     done = states.count(State.FINISHED)
-    console.print(f"{done} of {len(jobs)} runs finished: {folder / SUMMARY}", **say)  # type: ignore[arg-type]
+    console.print(f"{done} of {len(jobs)} runs finished: {folder / SUMMARY}")
     if done == len(jobs):
-        console.print(f"see them with: lagnet-plot {shlex.quote(str(folder))}", **say)  # type: ignore[arg-type]
+        console.print(f"see them with: {hint('lagnet-plot', folder)}")
         return 0
-    command = shlex.join(["lagnet-sweep", *sys.argv[1:]])
-    console.print(f"go on with the same command: {command}", **say)  # type: ignore[arg-type]
+    console.print(f"go on with the same command: {hint('lagnet-sweep', *sys.argv[1:])}")
     return 130 if State.STOPPED in states else 1

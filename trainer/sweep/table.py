@@ -55,7 +55,7 @@ class Board:
         for job in self._jobs:
             now = (job.state, job.node)
             if now != self._said.get(job.run.name, (State.WAITING, "")):
-                self._console.print(_line(job), highlight=False, soft_wrap=True)
+                self._console.print(_line(job))
                 self._said[job.run.name] = now
 
 
