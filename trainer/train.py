@@ -332,7 +332,8 @@ def prepare(config: Config) -> tuple[Config, Path]:
     folder = config.out
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise CheckpointError(
-            f"{folder} exists and is not empty: choose another --out, or continue it with --resume {folder}"
+            f"{folder} exists and is not empty: choose another --out, "
+            f"or continue it with {hint('--resume', folder)}"
         )
     return config, folder
 
