@@ -8,6 +8,7 @@ from decision.decider import BatchDecider, Decider
 from decision.decision import SAFE_ACTION, Decision, Decisions, Mode, OpenedBy, Origin, texts, unknown
 from decision.fallback import fall_back
 from decision.faults import Faults
+from decision.hazards import hazards_of_one
 from decision.memory import (
     MEMORY,
     MOST_OPEN,
@@ -34,6 +35,7 @@ __all__ = [
     "OpenedBy",
     "Origin",
     "fall_back",
+    "hazards_of_one",
     "memory_from_json",
     "memory_of",
     "memory_to_json",

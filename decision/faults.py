@@ -6,6 +6,7 @@ import logging
 import time
 from collections import Counter, deque
 from threading import Lock
+from typing import Any
 
 _QUIET = 60.0
 """How long a kind of fault is not logged again, and how long an internal one is remembered [s]."""
@@ -27,6 +28,12 @@ class Faults:
         self._logged: dict[str, float] = {}
         self._internal: deque[float] = deque(maxlen=1000)
         self._lock = Lock()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name != "_lock"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state, _lock=Lock())
 
     def note(self, kind: str, message: str, error: BaseException | None = None) -> None:
         """Count a fault, and log it if its kind was not logged for a minute.

@@ -155,6 +155,9 @@ class KeptOSQP:
         # A workspace is written to and solved in two calls: threads must not share one.
         self._own = threading.local()
 
+    def __reduce__(self) -> tuple[type[KeptOSQP], tuple[float]]:
+        return KeptOSQP, (self._eps,)
+
     def __call__(self, problem: Problem) -> FloatArray | None:
         """Solve one problem, or raise SolverError if OSQP finds neither a solution nor infeasibility."""
         import osqp

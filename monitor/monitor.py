@@ -21,6 +21,7 @@ from decision import (
     OpenedBy,
     Origin,
     fall_back,
+    hazards_of_one,
     memory_of,
     next_of_plan,
     texts,
@@ -143,7 +144,7 @@ class Monitor:
             lost = self._bad(error)
         try:
             row = np.array(observation, dtype=np.float64)[None]
-            given = None if hazards is None else _one_robots_hazards(hazards)
+            given = None if hazards is None else hazards_of_one(hazards)
         except (TypeError, ValueError) as error:
             return self._fall_back(past, self._bad(error))[0]
         return self._decide_or_fall_back(row, given, past, lost)[0]
@@ -294,18 +295,6 @@ def _filter_config(bundle: Bundle, config: FilterConfig) -> FilterConfig:
         hazard_radius=radius if config.hazard_radius is None else config.hazard_radius,
         robot=_robot(bundle) if config.robot is None else config.robot,
     )
-
-
-def _one_robots_hazards(hazards: ArrayLike) -> FloatArray:
-    """Hazards (1, n, 2) from (n, 2) or nothing; no other shape is guessed at, and none is left out."""
-    given = np.array(hazards, dtype=np.float64)
-    if given.shape == (0,):
-        return given.reshape(1, 0, 2)
-    if given.ndim != 2 or given.shape[1] != 2:
-        raise ValueError(f"hazards must have shape [n, 2], got {list(given.shape)}")
-    if not np.isfinite(given).all():
-        raise ValueError(f"hazards must be finite, got {given[~np.isfinite(given).all(axis=1)][0].tolist()}")
-    return given[None]
 
 
 def _check_layout(bundle: Bundle) -> None:

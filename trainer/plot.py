@@ -31,7 +31,7 @@ UNLIMITED = frozenset({"ppo"})
 """Algorithms that know no cost limit: one curve serves every panel."""
 
 _ROWS = (("return_100", "return"), ("cost_100", "cost return"), ("multiplier", "multiplier λ"))
-_BANDS = {"range": "lowest to highest seed", "deviation": "± one standard deviation over the seeds"}
+_BANDS = {"range": "lowest to highest", "deviation": "± one standard deviation"}
 
 _LIMIT = "limit d"
 # Told apart by lightness as well as by hue (after Okabe and Ito, and Tol), by dashes where two come close.
@@ -358,17 +358,27 @@ def spread(heights: Sequence[float], gap: float, low: float, high: float) -> lis
 
 
 def _caption(runs: Sequence[Curves], band: Band) -> str:
-    counts: dict[tuple[str, float | None], int] = defaultdict(int)
+    lines: dict[tuple[str, float | None], list[int | None]] = defaultdict(list)
     for run in runs:
-        counts[run.algorithm, run.cost_limit] += 1
-    least, most = min(counts.values()), max(counts.values())
-    if most == 1:
+        lines[run.algorithm, run.cost_limit].append(run.seed)
+    if max(map(len, lines.values())) == 1:
         return "mean of the last 100 episodes; λ: mean over the epoch's states"
-    seeds = f"{most}" if least == most else f"{least} to {most}"
+    # Runs of one seed, by two versions or from two machines, are no more seeds than one.
+    unlike = all(None not in seeds and len(set(seeds)) == len(seeds) for seeds in lines.values())
+    over = f"{_span([len(seeds) for seeds in lines.values()])} {'seeds' if unlike else 'runs'}"
+    if not unlike:
+        told = [len(set(seeds) - {None}) for seeds in lines.values()]
+        over += f" of {_span(told)} {'seed' if max(told) == 1 else 'seeds'}" if min(told) else ""
     return (
-        f"mean of the last 100 episodes, averaged over {seeds} seeds; band: {_BANDS[band]}; "
+        f"mean of the last 100 episodes, averaged over {over}; band: {_BANDS[band]}; "
         "λ: mean over the epoch's states"
     )
+
+
+def _span(counts: Sequence[int]) -> str:
+    """One number where all are alike, else the range."""
+    least, most = min(counts), max(counts)
+    return f"{most}" if least == most else f"{least} to {most}"
 
 
 def check_output(path: Path, dpi: int) -> None:

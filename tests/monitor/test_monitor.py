@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
 from pathlib import Path
 
 import numpy as np
@@ -528,3 +530,35 @@ def test_a_scan_that_contradicts_itself_opens_the_gate_and_is_counted(build, han
     # With the gate off, nothing but the policy decides.
     networks.action = [(1.0, 0.0)]
     assert build(networks, gate="off").decide(dead).mode == Mode.NOMINAL
+
+
+@pytest.mark.parametrize("way", ["copy", "deepcopy", "pickle"])
+@pytest.mark.parametrize("solver", ["planar", "osqp"])
+def test_a_copy_decides_alike_and_keeps_its_count(tiny_bundle, hand, way, solver) -> None:
+    monitor = Monitor.load(tiny_bundle, "always", filter_config=FilterConfig(solver=solver))
+    monitor.decide([1.0])
+    counts = dict(monitor.faults.counts)
+    other = pickle.loads(pickle.dumps(monitor)) if way == "pickle" else getattr(copy, way)(monitor)
+    assert other.faults.counts == counts
+    assert counts == {"bad input": 1}
+    observation = hand.observe(np.array([[0.5, 0.05]]), (1.4, 0.0))
+    mine, theirs = monitor.decide(observation), other.decide(observation)
+    assert mine.mode != Mode.NOMINAL
+    assert same_bits(mine.action, theirs.action)
+    assert (mine.origin, mine.risk, mine.barrier) == (theirs.origin, theirs.risk, theirs.barrier)
+    other.decide([1.0])
+    assert other.faults.counts["bad input"] == 2
+
+
+def test_any_row_of_a_batch_can_be_gone_on_from(build, hand) -> None:
+    """Also one that is counted from the end."""
+    monitor = build(build.networks([[1.0, 0.0]], [0.0]))
+    near = np.array([[0.45, 0.05]])
+    seen = np.array([hand.observe(near, (v, 0.0)) for v in (0.2, 0.6, 1.0)])
+    batch = monitor.decide_batch(seen)
+    for k in (-1, -2, -3, 0, 1, 2):
+        alone = monitor.decide(seen[k])
+        assert alone.memory["planned"]
+        assert batch[k].memory.tobytes() == alone.memory.tobytes()
+        assert same_bits(batch[k].action, alone.action)
+    assert len(batch[-1].plan) > 0

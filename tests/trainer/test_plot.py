@@ -2,6 +2,7 @@
 
 import json
 import sys
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -237,3 +238,23 @@ def test_one_run_named_twice_counts_once(tmp_path):
     assert len(plot.find_runs([tmp_path, run, run])) == 1
     with pytest.raises(ConfigError):
         plot.find_runs([])
+
+
+@pytest.mark.parametrize(
+    ("seeds", "said"),
+    [
+        ([[1, 2, 3]], "over 3 seeds"),
+        ([[1, 1]], "over 2 runs of 1 seed;"),
+        ([[1, 1, 2]], "over 3 runs of 2 seeds"),
+        ([[1, 2], [1, 2, 3]], "over 2 to 3 seeds"),
+        ([[None, None]], "over 2 runs;"),
+        ([[1], [2]], "mean of the last 100 episodes; λ"),
+    ],
+)
+def test_the_caption_counts_seeds_and_not_runs(seeds, said):
+    runs = [
+        replace(curves([1, 2], [3, 4], algorithm), seed=seed)
+        for algorithm, line in zip(("cpo", "ppo"), seeds, strict=False)
+        for seed in line
+    ]
+    assert said in plot._caption(runs, "range")
