@@ -48,6 +48,12 @@ def _digest() -> str:
     return digest.hexdigest()[:16]
 
 
+def _ours(folder: Path) -> bool:
+    """Whether nobody else can write there: what they wrote would run here."""
+    status = folder.stat()
+    return not hasattr(os, "getuid") or (status.st_uid in (0, os.getuid()) and not status.st_mode & 0o002)
+
+
 def _folder() -> Path | None:
     """Where machine code is kept: beside the source, else in the user's own part of the temporary folder."""
     places = [Path(__file__).parent / "__pycache__"]
@@ -56,10 +62,9 @@ def _folder() -> Path | None:
     for place in places:
         folder = place / _digest()
         try:
-            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-            # What somebody else could write there would run here.
-            owned = not hasattr(os, "getuid") or folder.parent.stat().st_uid in (0, os.getuid())
-            if owned and os.access(folder, os.W_OK):
+            for made in (place, folder):
+                made.mkdir(mode=0o700, parents=True, exist_ok=True)
+            if all(map(_ours, (place, folder))) and os.access(folder, os.W_OK):
                 return folder
         except OSError:
             continue
