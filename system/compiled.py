@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import os
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -56,19 +57,23 @@ def _ours(folder: Path) -> bool:
 
 def _folder() -> Path | None:
     """Where machine code is kept: beside the source, else in the user's own part of the temporary folder."""
-    places = [Path(__file__).parent / "__pycache__"]
-    if hasattr(os, "getuid"):
-        places.append(Path(tempfile.gettempdir()) / f"lagnet-{os.getuid()}")
-    for place in places:
+    for place in _places():
         folder = place / _digest()
         try:
             for made in (place, folder):
-                made.mkdir(mode=0o700, parents=True, exist_ok=True)
+                made.mkdir(mode=0o700, exist_ok=True)
             if all(map(_ours, (place, folder))) and os.access(folder, os.W_OK):
                 return folder
         except OSError:
             continue
     return None
+
+
+def _places() -> Iterator[Path]:
+    yield Path(__file__).parent / "__pycache__"
+    if hasattr(os, "getuid"):
+        with suppress(OSError):  # there may be no temporary folder that can be used
+            yield Path(tempfile.gettempdir()) / f"lagnet-{os.getuid()}"
 
 
 _FOLDER = _folder()

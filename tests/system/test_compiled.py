@@ -21,6 +21,11 @@ import monitor, system.compiled
 print(system.compiled.__file__)
 print(system.compiled._FOLDER)
 """
+NOWHERE = (
+    # One that cannot be written to, and none at all.
+    "import os, tempfile\ntempfile.tempdir = os.getcwd()",
+    "import tempfile\ndef none(): raise FileNotFoundError\ntempfile.gettempdir = none",
+)
 DECIDES = """
 import numpy as np
 from monitor import Monitor
@@ -80,18 +85,15 @@ def test_without_a_home_it_is_kept_in_the_temporary_folder_or_not_at_all(read_on
     Path(folder).parent.chmod(0o777)
     assert run(read_only, FOLDER, str(temporary))[-1] == "None"
     Path(folder).parent.chmod(0o700)
-    # tempfile falls back to the current folder, which cannot be written to either.
-    _, folder = run(
-        read_only, f"import tempfile; tempfile.tempdir = '/nonexistent'\n{FOLDER}", "/nonexistent"
-    )
-    assert folder == "None"
+    for script in NOWHERE:
+        assert run(read_only, script + FOLDER, str(temporary))[-1] == "None"
 
 
 @pytest.mark.long
 @pytest.mark.skipif(sys.platform != "linux", reason="drops the powers of root as Linux does")
 @pytest.mark.parametrize("temporary", ["there", "nowhere"])
 def test_and_decides(read_only: Path, temporary: str) -> None:
-    script = DECIDES if temporary == "there" else f"import tempfile; tempfile.tempdir = '/no'\n{DECIDES}"
+    script = DECIDES if temporary == "there" else NOWHERE[0] + DECIDES
     kept = read_only / "tmp"
     assert run(read_only, script, str(kept))[-1] == "nominal"
     assert any(kept.rglob("*.nbi")) == (temporary == "there")
