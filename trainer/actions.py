@@ -50,6 +50,12 @@ class ActionRange:
         edge: Floats = ((np.minimum(-self.low, self.high) - self.dead) / self.unit).astype(np.float32)
         return edge
 
+    @property
+    def gain(self) -> Floats:
+        """How far the action moves for a draw that moves by 1, at most [a]."""
+        gain: Floats = (self.unit + self.dead / RAMP).astype(np.float32)
+        return gain
+
     def sent(self, drawn: Tensor) -> Tensor:
         """Actions within the bounds [..., a] for the policy's draws [..., a]."""
         unit, dead, low, high = (torch.from_numpy(of) for of in (self.unit, self.dead, self.low, self.high))

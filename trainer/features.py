@@ -23,6 +23,8 @@ SHARPNESS = 12.0
 """Concentration of the map's directions: a hazard shows in those within about 1/√12 rad of its own."""
 TINY = 1e-6
 """Keeps divisors from 0: a lidar's reading, a squared length [m²]."""
+LARGE = 1e30
+"""Makes 1 and more of every reading that is not 0; onnxruntime's sign takes ten times as long as a clip."""
 _TURNED = ((1.0, 0.0, 0.0, -1.0), (0.0, 1.0, 1.0, 0.0))
 """From (x, y) to (x, y, y, −x): times (cos, sin, cos, sin), the terms of its parts along and to the left."""
 _PARTS = ((1.0, 0.0), (1.0, 0.0), (0.0, 1.0), (0.0, 1.0))
@@ -61,7 +63,6 @@ class Surroundings(nn.Module):
     quarters: Tensor
     coasting: Tensor
     ends: Tensor
-    squares: Tensor
     around: Tensor
     rates: Tensor
     counted: Tensor
@@ -86,15 +87,15 @@ class Surroundings(nn.Module):
             "middle": np.tile((bins + 0.5) * BIN_WIDTH, 2),
             "quarters": (np.pi / 2, 0, np.pi / 2, 0),
             "coasting": COASTING * np.asarray(_TURNED),
-            # x of both segments' ends, then y, from the coasting's terms and minus the way to the goal.
-            "ends": np.insert(np.kron(_PARTS, (1, 0)), 4, (0, -1, 0, 0), 0),
-            "squares": np.tile(np.eye(2), (2, 1)),
+            # x of both segments' ends, then y, from the coasting's terms and minus the way to the goal; each
+            # once a bin.
+            "ends": np.kron(np.insert(np.kron(_PARTS, (1, 0)), 4, (0, -1, 0, 0), 0), ones),
             # cos(a − b) = cos a cos b + sin a sin b, for every direction of the map; then the level.
             "around": (SHARPNESS * np.cos(angles), SHARPNESS * np.sin(angles), ones),
             "rates": np.r_[np.full(3 * LIDAR_BINS, -1 / length), ones],
-            # 0 for number 3 of an empty bin, above 0 for the rest.
-            "counted": np.kron((0, 0, 1, 0), np.eye(LIDAR_BINS)),
-            "always": np.r_[ones, ones, zeros, ones],
+            # 0 for number 3 of an empty bin, GAIN and more for the rest.
+            "counted": LARGE * np.kron((0, 0, 1, 0), np.eye(LIDAR_BINS)),
+            "always": GAIN * np.r_[ones, ones, zeros, ones],
             # Number 5 from (cos, sin, cos, sin), the coasting's terms and exp(−distance).
             "toward": np.block(
                 [
@@ -115,7 +116,7 @@ class Surroundings(nn.Module):
         goals, bearing = torch.split(self._bearings(lidars), LIDAR_BINS, 1)
         heading = goals.gather(1, goal.argmax(1, keepdim=True))
         reading = goal.amax(1, keepdim=True)
-        seen, behind = reading.sign(), (reading - 1) * LIDAR_RANGE
+        seen, behind = (reading * LARGE).clamp(max=1), (reading - 1) * LIDAR_RANGE
         turn = torch.sin(heading + self.quarters)
         coasting = turn * (observation[:, self.velocity] @ self.coasting)
 
@@ -123,11 +124,10 @@ class Surroundings(nn.Module):
         relative, distance = bearing - heading, (1 - hazards) * LIDAR_RANGE
         direction = torch.cat([torch.cos(relative), torch.sin(relative)], 1)
         ends = torch.cat([coasting, behind * seen], 1) @ self.ends
-        apart = self._from_segments(direction.view(-1, 2, LIDAR_BINS) * distance.unsqueeze(1), ends)
+        apart = self._from_segments(direction, distance, ends)
         shown = self._map(direction * seen, distance)
         exponent = torch.cat([distance, apart, shown], 1) * self.rates
-        counted = torch.addmm(self.always, hazards, self.counted).sign()
-        near = torch.exp(exponent) * counted * GAIN
+        near = torch.exp(exponent) * torch.addmm(self.always, hazards, self.counted).clamp(max=GAIN)
         to_goal = torch.cat([turn, coasting, torch.exp(behind)], 1) @ self.toward
         return torch.cat([near, to_goal * seen], 1)
 
@@ -138,20 +138,30 @@ class Surroundings(nn.Module):
         lower = torch.minimum(lidars @ self.preceding, divisor)
         return (upper - lower) / divisor * (BIN_WIDTH / 2) + self.middle
 
-    def _from_segments(self, place: Tensor, ends: Tensor) -> Tensor:
-        """Distances [B, 2 bins] of places [B, 2, bins] from the segments between robot and `ends` [B, 4]."""
-        square = ((ends * ends) @ self.squares).unsqueeze(2) + TINY
-        ends = ends.view(-1, 2, 2)
-        share = ((ends.transpose(1, 2) @ place) / square).clamp(0, 1)
-        apart = place.unsqueeze(2) - share.unsqueeze(1) * ends.unsqueeze(3)
-        x, y = torch.split((apart * apart).view(-1, 4 * LIDAR_BINS), 2 * LIDAR_BINS, 1)
-        return torch.sqrt(x + y)
+    def _from_segments(self, direction: Tensor, distance: Tensor, ends: Tensor) -> Tensor:
+        """Distances [B, 2 bins] of hazards from the segments between the robot and two ends.
+
+        The hazards lie in `direction` [B, 2 bins], cosines and sines, at a `distance` [B, bins]. The `ends`
+        [B, 4 bins] are x of the first, x of the second, y of the first, y of the second, each once a bin: all
+        flat, for onnxruntime takes its time over broadcasting.
+        """
+        x, y = torch.split(direction * torch.cat([distance, distance], 1), LIDAR_BINS, 1)
+        place = torch.cat([x, x, y, y], 1)
+        share = (_sum(place * ends) / (_sum(ends * ends) + TINY)).clamp(0, 1)
+        apart = place - torch.cat([share, share], 1) * ends
+        return torch.sqrt(_sum(apart * apart))
 
     def _map(self, direction: Tensor, distance: Tensor) -> Tensor:
         """log(number 4 / GAIN) [B, bins] of hazards' directions [B, 2 bins] and distances [B, bins]."""
         level = distance * (-0.5 / self.length) - SHARPNESS
         rays = torch.cat([direction, level], 1).view(-1, 3, LIDAR_BINS)
         return (rays.transpose(1, 2) @ self.around).amax(1)
+
+
+def _sum(parts: Tensor) -> Tensor:
+    """Of x and y [B, 4 bins] of two segments [B, 2 bins]."""
+    x, y = torch.split(parts, 2 * LIDAR_BINS, 1)
+    return x + y
 
 
 class Features(nn.Module):
@@ -168,6 +178,11 @@ class Features(nn.Module):
         self.normaliser = Normaliser(observations)
         self.surroundings = surroundings
         self.size = observations + (surroundings.size if surroundings else 0)
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """The precision that they are computed in."""
+        return self.normaliser.center.dtype
 
     def forward(self, observation: Tensor) -> Tensor:
         """Inputs [B, size] of raw observations [B, n]."""

@@ -17,10 +17,13 @@ OPSET = 20
 
 
 class Policy(nn.Module):
-    """Observation [B, n] → action [B, a]: the policy's mean, as it is sent to the robot.
+    """Observation [B, n] → action [B, a]: the policy's mean, as it is sent to the robot; float32 outside.
 
-    All in double precision: the way out of the dead zone is ten times as steep as what it leads to, and would
-    magnify the rounding of a network in single precision to the size of what export allows.
+    Args:
+        theta: the network's parameters [P].
+        shape: its layer sizes.
+        features: its inputs, in the precision that all is computed in.
+        actions: from draws to actions.
     """
 
     theta: Tensor
@@ -30,17 +33,18 @@ class Policy(nn.Module):
         self.features = features
         self.shape = shape
         self.actions = actions
-        self.register_buffer("theta", theta.detach().double())
+        self.register_buffer("theta", theta.detach().to(features.dtype))
 
     def forward(self, observation: Tensor) -> Tensor:
         """Actions [B, a] of raw observations [B, n]."""
-        return self.actions.sent(mlp(self.theta, self.features(observation.double()), self.shape)).float()
+        inputs = self.features(observation.to(self.features.dtype))
+        return self.actions.sent(mlp(self.theta, inputs, self.shape)).float()
 
 
 class Multiplier(nn.Module):
     """Observation [B, n] → multiplier [B].
 
-    The features are the policy's, in double precision, so that both graphs can share them; after them nothing
+    The features are the policy's, in its precision, so that both graphs can share them; after them nothing
     magnifies the rounding of single precision.
     """
 
@@ -51,7 +55,7 @@ class Multiplier(nn.Module):
 
     def forward(self, observation: Tensor) -> Tensor:
         """Multipliers [B] of raw observations [B, n]."""
-        return self.network(self.features(observation.double()).float())
+        return self.network(self.features(observation.to(self.features.dtype)).float())
 
 
 class Constant(nn.Module):
@@ -67,7 +71,7 @@ class Constant(nn.Module):
 
 
 def exact(features: Features) -> Features:
-    """The features in double precision, as the graphs compute them; the constants stay the single ones."""
+    """The features in double precision; the constants stay the single ones."""
     return copy.deepcopy(features).double()
 
 

@@ -2,6 +2,7 @@ import json
 from dataclasses import replace
 
 import numpy as np
+import onnx
 import onnxruntime
 import pytest
 import torch
@@ -64,19 +65,28 @@ def test_the_graphs_compute_what_torch_computes(run, bundle):
 
 def test_the_graphs_are_exact_for_a_policy_that_reacts_steeply(run):
     trained = TrainedRun(run)
-    with torch.no_grad():
-        trained.learner.actor.mul_(5)
     rng = np.random.default_rng(0)
     observation = rng.normal(0, 3, (1000, 60)).astype(np.float32)
     observation[:, 12:] = rng.random((1000, 48))
-    assert export.compare(trained, *trained.graphs(), observation)["onnx_difference_action"] < 1e-6
+    single, _ = export.graphs(trained, observation)
+    assert onnx.TensorProto.DOUBLE not in types(single[0])
+    with torch.no_grad():
+        trained.learner.actor.mul_(12)
+    double, differences = export.graphs(trained, observation)
+    assert onnx.TensorProto.DOUBLE in types(double[0])
+    assert differences["onnx_difference_action"] < 1e-6
+
+
+def types(graph: bytes) -> set[int]:
+    """Data types of a graph's constants."""
+    return {tensor.data_type for tensor in onnx.load_model_from_string(graph).graph.initializer}
 
 
 def test_graphs_that_differ_are_refused(run, tmp_path, monkeypatch):
     honest = TrainedRun.graphs
 
-    def shifted(self):
-        graphs = honest(self)
+    def shifted(self, precision):
+        graphs = honest(self, precision)
         with torch.no_grad():
             self.learner.actor[:100] += 0.01
         return graphs
