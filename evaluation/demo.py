@@ -16,11 +16,10 @@ import numpy as np
 import tyro
 from rich.console import Console
 
-from command import command, settings, terminal
+from command import command, progress_bar, settings, terminal
 from evaluation.closed_loop import Episodes, HazardSource, run_episodes
 from evaluation.errors import EvaluateError, ServiceError, ServiceGoneError
 from evaluation.pictures import Drive, animate, draw_drives, drive
-from evaluation.progress import progress_bar
 from evaluation.statistics import summarise
 from evaluation.tables import TABLE_WIDTH, table_console, tables
 from models import Bundle, BundleError

@@ -14,11 +14,10 @@ from typing import Annotated, Any, Literal
 import tyro
 from rich.console import Console
 
-from command import command, settings, why_not_file
+from command import command, progress_bar, settings, why_not_file
 from decision import BatchDecider
 from evaluation.closed_loop import Episodes, HazardSource, TaskError, run_episodes
 from evaluation.errors import EvaluateError, ServiceError, ServiceGoneError
-from evaluation.progress import progress_bar
 from evaluation.statistics import summarise
 from evaluation.tables import table_console, tables
 from guide import DEFAULT_STRENGTH, Strength

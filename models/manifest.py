@@ -56,6 +56,7 @@ class Manifest(_Strict):
         action_high: upper bounds of the action.
         threshold: the gate `risk` activates the filter where λ is above this.
         threshold_source: how the threshold was set.
+        multiplier_source: how λ came about.
         hysteresis: an open gate stays open while λ is above this share of the threshold.
         dwell: for how many control steps after that it still stays open.
         hazard_radius: radius of a hazard [m].
@@ -79,6 +80,7 @@ class Manifest(_Strict):
     action_high: Pair
     threshold: Annotated[float, Field(ge=0.0)]
     threshold_source: Annotated[str, Field(min_length=1)]
+    multiplier_source: str = ""
     hysteresis: Annotated[float, Field(gt=0.0, le=1.0)] = 1.0
     dwell: Annotated[int, Field(ge=0, le=1000)] = 0
     hazard_radius: Annotated[float, Field(gt=0.0)]

@@ -36,6 +36,12 @@ class Use(IntEnum):
     """`benchmarks.simulation`; the rest: its actions."""
     FILTER_SPEED = 8
     """The rest alone: the scenes that `benchmarks.filter` makes up."""
+    WARNING = 9
+    """The drives on which λ is fitted to warn; the rest: disturbances, weights, minibatches."""
+    GATE = 10
+    """`lagnet-calibrate`: the closed loops by which a gate is chosen."""
+    WARNING_REPORT = 11
+    """`lagnet-calibrate --report`: how well λ warns."""
 
 
 def rows(use: Use, seed: int, count: int) -> list[int]:

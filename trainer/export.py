@@ -1,6 +1,7 @@
 """`lagnet-export`: turns a run into a bundle, after checking that both compute the same."""
 
 import dataclasses
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -14,8 +15,10 @@ import numpy.typing as npt
 import onnxruntime
 import torch
 import tyro
+from rich.console import Console
+from torch import Tensor
 
-from command import command, settings, terminal, why_not_folder
+from command import command, progress_bar, settings, terminal, why_not_folder
 from models import BundleError, Manifest, ObservationBlock, check_target, write_bundle
 from pointgoal import seeds
 from pointgoal.observation import HAZARD_RADIUS, layout
@@ -31,6 +34,7 @@ from trainer.errors import CheckpointError, ExportError, TrainerError
 from trainer.learner import Learner
 from trainer.networks import mlp
 from trainer.train import below, level_of, load_config, make_environments, why_not_exported
+from trainer.warning import WarningConfig, fit
 
 TOLERANCE = 1e-5
 """Largest difference between torch and onnxruntime; relative to the value where that is above 1."""
@@ -58,6 +62,9 @@ class ExportConfig:
     """Deterministic closed-loop episodes that give the bundle its figures and its threshold."""
     threads: int = 2
     """Threads for physics."""
+    warning_episodes: int = 300
+    """Episodes of each of eight kinds on which λ is fitted to warn, with the policy frozen; 0 exports the
+    multiplier that trained it."""
     replace: bool = False
     """Whether a bundle that is there already is replaced."""
 
@@ -71,7 +78,10 @@ class TrainedRun:
         algorithm: its algorithm, which may have a multiplier network.
         steps: environment steps behind it.
         features: the learner's, in double precision.
+        multiplier: λ from the networks' inputs [B, m]; None for an algorithm without a multiplier network.
     """
+
+    multiplier: Callable[[Tensor], Tensor] | None
 
     def __init__(self, folder: Path) -> None:
         """Loads the last checkpoint.
@@ -94,6 +104,8 @@ class TrainedRun:
             for parameters in self.learner.parameters.values():
                 parameters.requires_grad_(False)
             self.features = onnx_graph.exact(self.learner.features)
+            network = self.algorithm.multiplier_network()
+            self.multiplier = None if network is None else partial(network, network=mlp)
         except (KeyError, ValueError, IndexError, TypeError) as error:
             raise CheckpointError(f"the checkpoint in {folder} does not fit its settings: {error}") from error
 
@@ -106,11 +118,10 @@ class TrainedRun:
 
     def multipliers(self, observation: Floats) -> Floats:
         """λ [B] of raw observations [B, n], likewise; a constant without a multiplier network."""
-        network = self.algorithm.multiplier_network()
-        if network is None:
+        if self.multiplier is None:
             return np.full(observation.shape[0], NO_NETWORK, np.float32)
         with torch.no_grad():
-            return np.asarray(network(self._exact(observation)).numpy())
+            return np.asarray(self.multiplier(self._exact(observation)).numpy())
 
     def _exact(self, observation: Floats) -> torch.Tensor:
         """The networks' inputs [B, m] in double precision."""
@@ -131,20 +142,20 @@ class TrainedRun:
         inputs = len(features.normaliser.mean)
         actor = learner.actor[: shape.size]
         policy = onnx_graph.Policy(actor, shape, features, self.range)
-        network = self.algorithm.multiplier_network()
         multiplier = (
             onnx_graph.Constant(NO_NETWORK)
-            if network is None
-            else onnx_graph.Multiplier(partial(network, network=mlp), features)
+            if self.multiplier is None
+            else onnx_graph.Multiplier(self.multiplier, features)
         )
         return onnx_graph.graph(policy, inputs, "action"), onnx_graph.graph(multiplier, inputs, "multiplier")
 
 
-def export(config: ExportConfig) -> Manifest:
+def export(config: ExportConfig, console: Console | None = None) -> Manifest:
     """Writes the bundle of a run.
 
     Args:
         config: what to export where.
+        console: where the progress bar goes; None for none.
 
     Returns:
         The manifest that was written.
@@ -155,6 +166,8 @@ def export(config: ExportConfig) -> Manifest:
         BundleError: if the bundle cannot be written.
     """
     torch.set_num_threads(1)
+    if config.warning_episodes < 0:
+        raise ExportError(f"--warning-episodes must be at least 0, not {config.warning_episodes}")
     if config.episodes < 1 or config.threads < 1:
         raise ExportError(
             f"--episodes and --threads must be at least 1, not {config.episodes} and {config.threads}"
@@ -162,6 +175,7 @@ def export(config: ExportConfig) -> Manifest:
     _check_target(config)
     run = TrainedRun(config.run)
     level = _level(run)
+    fitted = _fit(run, level, config.warning_episodes, console or Console(quiet=True))
     played = play(run, config.episodes, config.threads)
     seen = played.observation[np.isfinite(played.observation).all(-1)]
     rng = seeds.generator(Use.CALIBRATION, run.config.seed)
@@ -180,11 +194,12 @@ def export(config: ExportConfig) -> Manifest:
         action_high=(float(run.range.high[0]), float(run.range.high[1])),
         threshold=threshold.value,
         threshold_source=threshold.source,
+        multiplier_source=fitted.source,
         hazard_radius=HAZARD_RADIUS,
         robot=robot_constants(build_scene(level)),
         opset=onnx_graph.OPSET,
         training={k: v for k, v in dataclasses.asdict(run.config).items() if k not in {"out", "resume"}},
-        figures=_figures(played) | {"steps": float(run.steps)} | differences,
+        figures=_figures(played) | {"steps": float(run.steps)} | differences | fitted.figures,
         versions={name: version(name) for name in EXPORTED_BY},
     )
     return write_bundle(config.bundle, policy, multiplier, manifest).manifest
@@ -283,8 +298,39 @@ def _level(run: TrainedRun) -> int:
     return level_of(run.config.task)
 
 
+@dataclass(frozen=True)
+class _Fitted:
+    """What a manifest says of how λ came about."""
+
+    source: str
+    figures: dict[str, float]
+
+
+def _fit(run: TrainedRun, level: int, episodes: int, console: Console) -> _Fitted:
+    """Has the run's λ warn, where that is asked for and there is anything to warn of."""
+    if not episodes or level == 0:
+        return _Fitted(f"as {run.config.algorithm} trained it", {})
+    settings = WarningConfig(episodes=episodes)
+    with progress_bar(console) as bar:
+        job = bar.add_task("fitting λ", total=1.0)
+        run.multiplier, figures = fit(
+            run.act,
+            run.learner.features,
+            level,
+            run.range.high,
+            settings,
+            run.config.seed,
+            lambda share: bar.update(job, completed=share),
+        )
+    source = (
+        f"fitted with the policy frozen: discounted maximum of violation (1) and barrier below its floor "
+        f"({settings.floor}), γ = {settings.discount}, on {figures['warning_states']:.0f} states"
+    )
+    return _Fitted(source, figures)
+
+
 def _threshold(run: TrainedRun, played: Episodes) -> Threshold:
-    if run.algorithm.multiplier_network() is None:
+    if run.multiplier is None:
         return Threshold(0.0, f"gate always open: {run.config.algorithm} has no multiplier network")
     multiplier = np.stack([run.multipliers(row) for row in np.nan_to_num(played.observation)])
     return calibrate(multiplier, played.cost)
@@ -305,8 +351,8 @@ def main() -> None:
     """Console script `lagnet-export`."""
     with command("lagnet-export", TrainerError, BundleError, status=1):
         config = settings(ExportConfig, "lagnet-export")
-        manifest = export(config)
         console = terminal()
+        manifest = export(config, console)
         figures = manifest.figures
         console.print(
             f"{config.bundle}: return {figures['return']:.2f}, cost {figures['cost']:.3f} "

@@ -13,6 +13,7 @@ from trainer.config import Config
 from trainer.errors import CheckpointError, ExportError
 from trainer.export import ExportConfig, TrainedRun
 from trainer.train import train
+from trainer.warning import WarningConfig
 
 SETTINGS = {
     "total_steps": 400, "num_envs": 4, "epoch_steps": 200, "minibatch": 100, "passes": 1, "threads": 1,
@@ -30,7 +31,7 @@ def run(tmp_path_factory):
 @pytest.fixture(scope="module")
 def bundle(run):
     target = run.parent / "bundle"
-    export.export(ExportConfig(run, target, episodes=3, threads=1))
+    export.export(ExportConfig(run, target, episodes=3, threads=1, warning_episodes=0))
     return Bundle.load(target)
 
 
@@ -82,6 +83,19 @@ def types(graph: bytes) -> set[int]:
     return {tensor.data_type for tensor in onnx.load_model_from_string(graph).graph.initializer}
 
 
+def test_by_default_what_is_exported_warns(run, tmp_path, monkeypatch):
+    monkeypatch.setattr(export, "WarningConfig", lambda episodes: WarningConfig(episodes, minibatches=50))
+    asked = ExportConfig(run, tmp_path / "bundle", episodes=2, threads=1, warning_episodes=1)
+    manifest = export.export(asked)
+    assert manifest.multiplier_source.startswith("fitted with the policy frozen")
+    assert manifest.figures["warning_states"] > 3000
+    assert manifest.figures["onnx_difference_multiplier"] <= export.TOLERANCE
+    bundle = Bundle.load(tmp_path / "bundle")
+    observation = np.zeros((2, 60), np.float32)
+    (risk,) = onnxruntime.InferenceSession(bundle.multiplier).run(None, {"observation": observation})
+    assert ((risk > 0.0) & (risk < 1.0)).all()
+
+
 def test_graphs_that_differ_are_refused(run, tmp_path, monkeypatch):
     honest = TrainedRun.graphs
 
@@ -93,13 +107,15 @@ def test_graphs_that_differ_are_refused(run, tmp_path, monkeypatch):
 
     monkeypatch.setattr(TrainedRun, "graphs", shifted)
     with pytest.raises(ExportError, match=r"differ by .* in the action"):
-        export.export(ExportConfig(run, tmp_path / "bundle", episodes=2, threads=1))
+        export.export(ExportConfig(run, tmp_path / "bundle", episodes=2, threads=1, warning_episodes=0))
     assert not (tmp_path / "bundle").exists()
 
 
 def test_an_algorithm_without_multiplier_network_leaves_the_gate_open(tmp_path):
     train(Config(algorithm="ppo", out=tmp_path / "run", **SETTINGS))
-    manifest = export.export(ExportConfig(tmp_path / "run", tmp_path / "bundle", episodes=2, threads=1))
+    manifest = export.export(
+        ExportConfig(tmp_path / "run", tmp_path / "bundle", episodes=2, threads=1, warning_episodes=0)
+    )
     assert manifest.threshold < export.NO_NETWORK
     assert "no multiplier network" in manifest.threshold_source
 
