@@ -112,8 +112,9 @@ def run_episodes(
     record: bool = False,
     progress: Callable[[int], None] | None = None,
     use: Use = Use.EVALUATION,
+    first: int = 0,
 ) -> Episodes:
-    """Runs episodes to their ends, up to `SIDE_BY_SIDE` at once; episode i takes `seeds.rows` number i.
+    """Runs episodes to their ends, up to `SIDE_BY_SIDE` at once; episode i has layout number first + i.
 
     Args:
         task: gymnasium id of the task.
@@ -124,6 +125,7 @@ def run_episodes(
         record: whether to keep the trajectory; then all of them must fit side by side.
         progress: called with the count of steps that were made since the last call.
         use: what for; together with the seed it says which layouts.
+        first: how many layouts of that use and seed to leave to others.
 
     Raises:
         ValueError: if there is no episode to run, or too many to record.
@@ -133,7 +135,7 @@ def run_episodes(
         raise ValueError(f"episodes must be at least 1, got {episodes}")
     if record and episodes > SIDE_BY_SIDE:
         raise ValueError(f"at most {SIDE_BY_SIDE} episodes can be recorded, got {episodes}")
-    rows, rng = seeds.rows(use, seed, episodes), seeds.generator(use, seed)
+    rows, rng = seeds.rows(use, seed, first + episodes)[first:], seeds.generator(use, seed)
     tally, recording = _Tally(episodes), _Recording() if record else None
     states: list[_State] = []
     size = side_by_side(episodes, SIDE_BY_SIDE)

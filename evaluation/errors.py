@@ -13,3 +13,7 @@ class ServiceError(RuntimeError):
 
 class ServiceGoneError(RuntimeError):
     """A service that stopped answering while robots were driving: what they did then is no evaluation."""
+
+
+class CalibrateError(ValueError):
+    """A calibration that cannot be done as asked, or in which no gate did what was asked."""

@@ -2,6 +2,14 @@
 
 from models.bundle import Bundle, check_target, write_bundle
 from models.errors import BundleError
-from models.manifest import Manifest, ObservationBlock
+from models.manifest import Calibration, Manifest, ObservationBlock
 
-__all__ = ["Bundle", "BundleError", "Manifest", "ObservationBlock", "check_target", "write_bundle"]
+__all__ = [
+    "Bundle",
+    "BundleError",
+    "Calibration",
+    "Manifest",
+    "ObservationBlock",
+    "check_target",
+    "write_bundle",
+]

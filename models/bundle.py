@@ -106,7 +106,11 @@ def write_bundle(path: str | Path, policy_onnx: bytes, multiplier_onnx: bytes, m
     target = Path(path)
     check_target(target)
     digests = {POLICY_FILE: _digest(policy_onnx), MULTIPLIER_FILE: _digest(multiplier_onnx)}
-    complete = manifest.model_dump() | {"sha256": digests}
+    try:
+        complete = Manifest.model_validate(manifest.model_dump() | {"sha256": digests}).to_json()
+    except ValidationError as error:
+        reason = "; ".join(detail["msg"] for detail in error.errors())
+        raise BundleError(f"{target}: its manifest would contradict itself: {reason}") from error
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         temporary = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
@@ -115,7 +119,7 @@ def write_bundle(path: str | Path, policy_onnx: bytes, multiplier_onnx: bytes, m
             fresh.mkdir()
             (fresh / POLICY_FILE).write_bytes(policy_onnx)
             (fresh / MULTIPLIER_FILE).write_bytes(multiplier_onnx)
-            (fresh / MANIFEST_FILE).write_text(Manifest.model_validate(complete).to_json(), encoding="utf-8")
+            (fresh / MANIFEST_FILE).write_text(complete, encoding="utf-8")
             _check(fresh, target)
             _move_into_place(fresh, target, aside=temporary / "old")
         finally:

@@ -40,6 +40,38 @@ class ObservationBlock(_Strict):
     unit: str
 
 
+class Calibration(_Strict):
+    """How the gate was chosen, and what that promises.
+
+    Attributes:
+        method: "closed loop": of gates in a fixed order, from the most open one on, each was tried on fresh
+            episodes of the loop that is deployed; the last one that passed was taken. "onset": by the order
+            statistic of the smallest λ ahead of violations of unfiltered episodes.
+        miss_rate: α: an episode is missed, in that the barrier had to open the gate before λ did (or, of
+            "onset", λ was not above the threshold all the time ahead of a violation), with at most this
+            probability,
+        confidence: with this confidence 1 − δ.
+        episodes: that each gate was tried on.
+        missed: of those, under the gate that was taken.
+        violated_without_floor: of as many episodes with the barrier's floor off, how many had a violation.
+        hazards: what the filter knew of them.
+        tried: how many gates.
+        seed: of the episodes.
+        multiplier: the SHA-256 of the multiplier.onnx that it is for.
+    """
+
+    method: Literal["closed loop", "onset"]
+    miss_rate: Annotated[float, Field(gt=0.0, lt=1.0)]
+    confidence: Annotated[float, Field(gt=0.0, lt=1.0)]
+    episodes: Positive
+    missed: Annotated[int, Field(ge=0)]
+    violated_without_floor: Annotated[int, Field(ge=0)] | None = None
+    hazards: Literal["given", "lidar"]
+    tried: Positive
+    seed: Annotated[int, Field(ge=0)]
+    multiplier: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+
+
 class Manifest(_Strict):
     """What a bundle says about itself; written as manifest.json.
 
@@ -59,6 +91,7 @@ class Manifest(_Strict):
         multiplier_source: how λ came about.
         hysteresis: an open gate stays open while λ is above this share of the threshold.
         dwell: for how many control steps after that it still stays open.
+        calibration: how threshold, hysteresis and dwell were chosen; None: they were not.
         hazard_radius: radius of a hazard [m].
         robot: the robot's constants, name → number, as `system.Robot` names them; empty: the task's own.
         opset: version of the standard ONNX operators that both graphs use.
@@ -83,6 +116,7 @@ class Manifest(_Strict):
     multiplier_source: str = ""
     hysteresis: Annotated[float, Field(gt=0.0, le=1.0)] = 1.0
     dwell: Annotated[int, Field(ge=0, le=1000)] = 0
+    calibration: Calibration | None = None
     hazard_radius: Annotated[float, Field(gt=0.0)]
     robot: dict[str, Annotated[int | float, Field(gt=0)]] = {}
     opset: Positive
@@ -104,6 +138,9 @@ class Manifest(_Strict):
 
     @model_validator(mode="after")
     def _agrees_with_itself(self) -> Self:
+        known = self.sha256.get("multiplier.onnx")
+        if self.calibration is not None and known not in (None, self.calibration.multiplier):
+            raise ValueError("calibration: it is for another multiplier.onnx")
         start, names = 0, set()
         for block in self.observation_layout:
             if block.start != start or block.name in names:

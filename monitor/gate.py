@@ -31,6 +31,7 @@ class Gate:
         hysteresis: in (0, 1]. An open gate `risk` stays open while risk > hysteresis · threshold, while the
             barrier is low, and while the filter sends another action than the policy's.
         dwell: for how many control steps after that it still stays open, in a robot's memory.
+        floor: whether a low barrier opens it; without, nothing is certified where λ is silent: to measure λ.
 
     Raises:
         MonitorError: for an unknown name, or a number that is out of its range.
@@ -40,6 +41,7 @@ class Gate:
     threshold: float
     hysteresis: float = 1.0
     dwell: int = 0
+    floor: bool = True
 
     def __post_init__(self) -> None:
         """Refuse what is no gate."""
@@ -63,7 +65,7 @@ class Gate:
         n = len(risk)
         if self.name != "risk":
             return texts(OpenedBy.ALWAYS if self.name == "always" else "", n)
-        opened = np.where(low, texts(OpenedBy.BARRIER, n), texts("", n))
+        opened = np.where(low & self.floor, texts(OpenedBy.BARRIER, n), texts("", n))
         opened = np.where(memory["open"] > 0, texts(OpenedBy.DWELL, n), opened)
         return np.where(risk <= self.threshold, opened, texts(OpenedBy.RISK, n))
 
@@ -73,6 +75,7 @@ class Gate:
         ``changed`` (N,): whether the filter sends another action than the policy's.
         """
         if self.name == "risk" and self.dwell:
+            low = low & self.floor
             engaged = ~(risk <= self.threshold * self.hysteresis) | low | changed
             before = memory["open"]
             opened = (before > 0) | ~(risk <= self.threshold) | low

@@ -55,7 +55,7 @@ class Monitor:
         bundle: the checked bundle.
         networks: its networks.
         action_filter: the filter.
-        gate: when the filter is active.
+        gate: when the filter is active: its name, and the bundle says the rest; or all of it.
         threshold: λ above which the gate `risk` opens; None takes the bundle's.
         guide: how much the filter's guide may do, to be told.
 
@@ -73,7 +73,7 @@ class Monitor:
         bundle: Bundle,
         networks: Networks,
         action_filter: ActionFilter,
-        gate: GateName = "risk",
+        gate: GateName | Gate = "risk",
         threshold: float | None = None,
         guide: Strength = "off",
     ) -> None:
@@ -84,7 +84,8 @@ class Monitor:
         self.guide: Strength = guide
         self.faults = Faults()
         wanted = manifest.threshold if threshold is None else float(threshold)
-        self.gate = Gate(gate, wanted, manifest.hysteresis, manifest.dwell)
+        own = Gate(gate, wanted, manifest.hysteresis, manifest.dwell) if isinstance(gate, str) else gate
+        self.gate: Gate = own
         self._networks = networks
         self._filter = action_filter
         self._low = np.array(manifest.action_low, np.float64)
@@ -94,7 +95,7 @@ class Monitor:
     @staticmethod
     def load(
         path: str | Path,
-        gate: GateName = "risk",
+        gate: GateName | Gate = "risk",
         threshold: float | None = None,
         filter_config: FilterConfig | None = None,
         guide: Strength = DEFAULT_STRENGTH,
@@ -103,7 +104,7 @@ class Monitor:
 
         Args:
             path: the bundle's folder.
-            gate: when the filter is active.
+            gate: when the filter is active: its name, and the bundle says the rest; or all of it.
             threshold: λ above which the gate `risk` opens; None takes the bundle's.
             filter_config: the filter's settings; None takes the defaults. The hazards' radius and the robot's
                 constants are the bundle's where the settings leave them open.
