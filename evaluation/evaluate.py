@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 import tyro
 from rich.console import Console
 
-from command import command, progress_bar, settings, why_not_file
+from command import command, progress_bar, settings, why_not_file, why_not_folder
 from decision import BatchDecider
 from evaluation.closed_loop import Episodes, HazardSource, TaskError, run_episodes
 from evaluation.errors import EvaluateError, ServiceError, ServiceGoneError
@@ -66,6 +66,8 @@ class EvaluateConfig:
     """With --url: file that holds the key; otherwise the environment variable LAGNET_API_KEY."""
     json: Path | None = None
     """File for the figures."""
+    figure: Path | None = None
+    """Folder for the paper's figures 5 and 6, of one episode without filter; nothing else is run then."""
 
 
 def evaluate(config: EvaluateConfig, console: Console) -> tuple[Runs, dict[str, Any]]:
@@ -151,6 +153,19 @@ def _each(episodes: Episodes) -> dict[str, Any]:
     }
 
 
+def _figures(bundle: Path, seed: int, folder: Path, console: Console) -> None:
+    from evaluation.figures import write_figures
+
+    if why := why_not_folder(folder):
+        raise EvaluateError(f"--figure {folder}: {why}")
+    episode = write_figures(Bundle.load(bundle), seed, folder)
+    console.print(
+        f"{folder / 'figure5.png'}: return {episode.reward.sum():.1f}, depth cost {episode.cost.sum():.2f}, "
+        f"λ from {episode.risk.min():.3g} to {episode.risk.max():.3g}"
+    )
+    console.print(f"{folder / 'figure6.png'}: the moments of the stars")
+
+
 def _title(config: EvaluateConfig, who: dict[str, Any]) -> str:
     return (
         f"{who['model']}, {config.episodes} episodes, {config.url or 'in process'}\n"
@@ -167,6 +182,9 @@ def main() -> None:
     with command("lagnet-evaluate", *expected), command("lagnet-evaluate", ServiceGoneError, status=1):
         config = settings(EvaluateConfig, "lagnet-evaluate")
         console = table_console()
+        if config.figure is not None:
+            _figures(config.bundle, config.seed, config.figure, console)
+            return
         runs, who = evaluate(config, console)
         summaries = {_LABELS[source]: summarise(episodes) for source, episodes in runs.items()}
         console.print(tables(_title(config, who), summaries))
