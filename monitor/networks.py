@@ -31,9 +31,9 @@ class Networks:
         self._bundle = bundle
         self.observation_size = bundle.manifest.observation_size
         try:
-            self._sessions = [_session("joined", bundle.joined())]
+            self._sessions = [session("joined", bundle.joined())]
         except (BundleError, NetworkError):  # each by itself: it runs, or is named
-            self._sessions = [_session("policy", bundle.policy), _session("multiplier", bundle.multiplier)]
+            self._sessions = [session("policy", bundle.policy), session("multiplier", bundle.multiplier)]
 
     def __reduce__(self) -> tuple[type[Networks], tuple[Bundle]]:
         return Networks, (self._bundle,)
@@ -52,7 +52,8 @@ class Networks:
         return action.astype(np.float64), risk.astype(np.float64)
 
 
-def _session(name: str, graph: bytes) -> onnxruntime.InferenceSession:
+def session(name: str, graph: bytes) -> onnxruntime.InferenceSession:
+    """A graph, ready to run; NetworkError if onnxruntime refuses it."""
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
