@@ -40,13 +40,13 @@ class Guard:
             return
         headers: dict[bytes, bytes] = dict(scope["headers"])
         if self._key is not None and scope["path"] not in OPEN_PATHS and not _carries(headers, self._key):
-            await _refuse(send, 401, "header", "authorization", "a valid API key is required")
+            await refuse(send, 401, "header", "authorization", "a valid API key is required")
             return
         too_large = f"the body must not exceed {self._max_body} bytes"
         stated = headers.get(b"content-length", b"0")
         # int() refuses thousands of digits.
         if stated.isdigit() and (len(stated) > _MAX_DIGITS or int(stated) > self._max_body):
-            await _refuse(send, 413, "body", "content-length", too_large)
+            await refuse(send, 413, "body", "content-length", too_large)
             return
         received = 0
 
@@ -70,12 +70,15 @@ def _carries(headers: dict[bytes, bytes], key: bytes) -> bool:
     return hmac.compare_digest(given, key)
 
 
-async def _refuse(send: Send, status: int, place: str, name: str, message: str) -> None:
+async def refuse(send: Send, status: int, place: str, name: str, message: str) -> None:
+    """Answers a request that is not read, and closes its connection."""
     detail = [{"loc": [place, name], "msg": message, "type": "refused"}]
     body = json.dumps({"detail": detail}).encode()
     headers = [(b"content-type", b"application/json"), (b"content-length", str(len(body)).encode())]
     if status == 401:
         headers.append((b"www-authenticate", b"Bearer"))
+    if status == 503:
+        headers.append((b"retry-after", b"1"))
     # The body was not read: the connection cannot carry another request.
     headers.append((b"connection", b"close"))
     await send({"type": "http.response.start", "status": status, "headers": headers})
