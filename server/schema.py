@@ -27,6 +27,8 @@ Pair = Annotated[list[Finite], Field(min_length=2, max_length=2)]
 RequestNumber = Annotated[int, Field(strict=True, ge=0, lt=2**63)]
 MAX_HAZARDS = 1000
 """Most hazards a request may name."""
+HazardIndex = Annotated[int, Field(strict=True, ge=0, lt=2 * MAX_HAZARDS)]
+"""The request's hazards are counted first, then what the lidar shows."""
 
 
 class MemoryJson(BaseModel):
@@ -118,10 +120,11 @@ def _memory(value: MemoryJson) -> np.void:
     return memory
 
 
-_AS_IT_IS = (Mode, bool, Origin | None, OpenedBy | None, int | None, str | None)
+_AS_IT_IS = (Mode, bool, Origin | None, OpenedBy | None, str | None)
 _WIRE: dict[Any, Wire] = {
     FloatArray: Wire(Pair | None, _finite_pair, _pair),
     float: Wire(Finite | None, _finite, _number),
+    int | None: Wire(HazardIndex | None),
     np.void: Wire(MemoryJson, memory_to_json, _memory),
     **{kind: Wire(kind) for kind in _AS_IT_IS},
 }
