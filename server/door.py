@@ -9,14 +9,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, cast
 
 import httptools
 from uvicorn._types import ASGIReceiveCallable, ASGISendCallable, Scope
-from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
+from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol, RequestResponseCycle
 from uvicorn.server import ServerState
 
-from server.guard import OPEN_PATHS, refuse
+from server.guard import AT_ONCE, OPEN_PATHS, refuse
 
 MAX_HEAD = 65536
 """Most bytes that may come before a request's head is whole; a robot's has 200."""
@@ -162,6 +163,8 @@ class Connection(HttpToolsProtocol):
         self._checks = self.url.partition(b"?")[0] in _OPEN_PATHS
         self.app = _busy if not self._checks and self._door.full(self) else self.config.loaded_app
         super().on_headers_complete()
+        at_once: Any = partial(self._at_once, self.cycle)
+        self.scope["extensions"] = {AT_ONCE: at_once}
 
     def on_message_complete(self) -> None:
         """The request has come whole: from here on it is we who are slow."""
@@ -199,6 +202,22 @@ class Connection(HttpToolsProtocol):
         if self._reading and self._has_its_say():
             self.transport.write(_TOO_SLOW)
         self.transport.close()
+
+    def _at_once(self, cycle: RequestResponseCycle, status: int, content: bytes) -> bool:
+        """Answers a request with JSON in one packet; uvicorn would send head and body apart."""
+        if cycle.disconnected or self.flow.write_paused:
+            return False
+        head = [STATUS_LINE[status], *(b"%b: %b\r\n" % header for header in cycle.default_headers)]
+        if not cycle.keep_alive:
+            head.append(b"connection: close\r\n")
+        head.append(b"content-type: application/json\r\ncontent-length: %d\r\n\r\n" % len(content))
+        cycle.response_started = cycle.response_complete = True
+        self.transport.write(b"".join([*head, content]))
+        cycle.message_event.set()
+        if not cycle.keep_alive:
+            self.transport.close()
+        cycle.on_response()
+        return True
 
     def _has_its_say(self) -> bool:
         """Whether the next word to the other side is the answer to the request that is being read."""

@@ -12,6 +12,9 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 OPEN_PATHS = frozenset({"/healthz", "/readyz"})
 """What an orchestrator may ask without a key."""
 
+AT_ONCE = "lagnet.at_once"
+"""The ASGI extension by which the server takes status and body of a JSON reply at once: True if it did."""
+
 _MAX_DIGITS = 18
 
 
@@ -43,25 +46,32 @@ class Guard:
             await refuse(send, 401, "header", "authorization", "a valid API key is required")
             return
         too_large = f"the body must not exceed {self._max_body} bytes"
-        stated = headers.get(b"content-length", b"0")
+        stated = headers.get(b"content-length", b"")
         # int() refuses thousands of digits.
         if stated.isdigit() and (len(stated) > _MAX_DIGITS or int(stated) > self._max_body):
             await refuse(send, 413, "body", "content-length", too_large)
             return
-        received = 0
-
-        async def limited() -> Message:
-            nonlocal received
-            message = await receive()
-            if message["type"] == "http.request":
-                received += len(message.get("body", b""))
-                if received > self._max_body:
-                    raise BodyTooLargeError(too_large)
-            return message
-
+        if not stated.isdigit() or b"transfer-encoding" in headers:
+            receive = _limited(receive, self._max_body, too_large)
         # Who hangs up in the middle of a body gets no reply, and leaves no traceback in the log.
         with suppress(ClientDisconnect):
-            await self._app(scope, limited, send)
+            await self._app(scope, receive, send)
+
+
+def _limited(receive: Receive, max_body: int, too_large: str) -> Receive:
+    """Counts what comes of a body whose length was not stated."""
+    received = 0
+
+    async def limited() -> Message:
+        nonlocal received
+        message = await receive()
+        if message["type"] == "http.request":
+            received += len(message.get("body", b""))
+            if received > max_body:
+                raise BodyTooLargeError(too_large)
+        return message
+
+    return limited
 
 
 def _carries(headers: dict[bytes, bytes], key: bytes) -> bool:

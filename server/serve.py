@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import ipaddress
 import json
 import math
@@ -214,6 +215,9 @@ def serve(config: ServeConfig) -> None:
         ready = {"event": "listening", "url": url, "host": host, "port": port, "model": monitor.bundle.id}
         gate = {"gate": monitor.gate.name, "threshold": monitor.gate.threshold, "guide": config.guide}
         announcement = json.dumps(ready | gate)
+        # What is loaded stays: looking through it again and again for garbage would hold up decisions.
+        gc.collect()
+        gc.freeze()
         _server(app, lifecycle, config, announcement).run(sockets=[listener])
 
 
