@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hmac
 import json
+from collections.abc import Mapping
 from contextlib import suppress
 
 from starlette.requests import ClientDisconnect
@@ -29,12 +30,16 @@ class Guard:
         app: what it guards.
         api_key: the key that `Authorization: Bearer KEY` or `X-API-Key: KEY` must carry; None asks for none.
         max_body: most bytes of a request's body.
+        larger: path → most bytes of a body there, where that is more.
     """
 
-    def __init__(self, app: ASGIApp, api_key: str | None, max_body: int) -> None:
+    def __init__(
+        self, app: ASGIApp, api_key: str | None, max_body: int, larger: Mapping[str, int] | None = None
+    ) -> None:
         self._app = app
         self._key = None if api_key is None else api_key.encode()
         self._max_body = max_body
+        self._larger = larger or {}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Handles one connection."""
@@ -45,20 +50,24 @@ class Guard:
         if self._key is not None and scope["path"] not in OPEN_PATHS and not _carries(headers, self._key):
             await refuse(send, 401, "header", "authorization", "a valid API key is required")
             return
-        too_large = f"the body must not exceed {self._max_body} bytes"
+        max_body = self._larger.get(scope["path"], self._max_body)
         stated = headers.get(b"content-length", b"")
         # int() refuses thousands of digits.
-        if stated.isdigit() and (len(stated) > _MAX_DIGITS or int(stated) > self._max_body):
-            await refuse(send, 413, "body", "content-length", too_large)
+        if stated.isdigit() and (len(stated) > _MAX_DIGITS or int(stated) > max_body):
+            await refuse(send, 413, "body", "content-length", _too_large(max_body))
             return
         if not stated.isdigit() or b"transfer-encoding" in headers:
-            receive = _limited(receive, self._max_body, too_large)
+            receive = _limited(receive, max_body)
         # Who hangs up in the middle of a body gets no reply, and leaves no traceback in the log.
         with suppress(ClientDisconnect):
             await self._app(scope, receive, send)
 
 
-def _limited(receive: Receive, max_body: int, too_large: str) -> Receive:
+def _too_large(max_body: int) -> str:
+    return f"the body must not exceed {max_body} bytes"
+
+
+def _limited(receive: Receive, max_body: int) -> Receive:
     """Counts what comes of a body whose length was not stated."""
     received = 0
 
@@ -68,7 +77,7 @@ def _limited(receive: Receive, max_body: int, too_large: str) -> Receive:
         if message["type"] == "http.request":
             received += len(message.get("body", b""))
             if received > max_body:
-                raise BodyTooLargeError(too_large)
+                raise BodyTooLargeError(_too_large(max_body))
         return message
 
     return limited
