@@ -118,6 +118,11 @@ def in_turn(*behaviours: Act) -> Act:
     return behaviour
 
 
+def by_number(*behaviours: Act) -> Act:
+    """Answers the first request with the first behaviour, and so on, whether or not the others arrive."""
+    return lambda connection, asked: behaviours[json.loads(asked)["request"] - 1](connection, asked)
+
+
 def planned(actions: list[list[float]] = PLAN) -> np.void:
     """A robot's memory that holds a plan."""
     memory = np.zeros(1, MEMORY)
@@ -256,7 +261,7 @@ def twice(connection: socket.socket, asked: bytes) -> None:
 
 def test_a_reply_that_comes_twice_answers_one_request(fake, monitor, observation) -> None:
     last = replies(action=[0.0, 0.25], mode="filtered", origin="barrier")
-    with fake(monitor, in_turn(twice, replies(), last)) as url, Client(url, timeout=5.0) as client:
+    with fake(monitor, by_number(twice, replies(), last)) as url, Client(url, timeout=5.0) as client:
         assert client.decide(observation).reason is None
         time.sleep(0.4)
         assert_fallback(client.decide(observation, memory=planned()), "of request 1, not 2", PLAN[0], left=2)
