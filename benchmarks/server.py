@@ -139,7 +139,7 @@ class Case:
 
 
 def cases(level: int) -> dict[str, Case]:
-    """A robot at rest with nothing near, and one that would drive into a hazard."""
+    """A robot at rest with a hazard in sight, and one that would drive into it."""
     blocks = layout(level)
     at_rest = np.zeros(blocks.size)
     at_rest[blocks.slice("accelerometer")] = (0.0, 0.0, 9.81)
@@ -148,13 +148,17 @@ def cases(level: int) -> dict[str, Case]:
     driving[blocks.slice("velocimeter")] = (0.8, 0.0, 0.0)
     ahead = blocks.slice("goal_lidar").start
     driving[[ahead, ahead + 1, ahead + 15]] = (0.5, 0.25, 0.25)
+    far, near = np.array([[[1.5, 1.2]]]), np.array([[[0.3, 0.03]]])
+    if "hazards_lidar" in blocks:
+        at_rest[blocks.slice("hazards_lidar")] = encode(far)[0]
+        driving[blocks.slice("hazards_lidar")] = encode(near)[0]
     plan = {"side": 5, "guided": 0, "plan": [[0.05, 0.5]] * PLAN_STEPS}
     plain = {"request": 1, "observation": at_rest.tolist()}
-    near = {"request": 1, "observation": driving.tolist(), "hazards": [[0.3, 0.03]], "memory": plan}
+    stop = {"request": 1, "observation": driving.tolist(), "hazards": near[0].tolist(), "memory": plan}
     return {
         "nominal": Case(plain, Mode.NOMINAL),
         "nominal, a full memory": Case(plain | {"memory": plan}, Mode.NOMINAL),
-        "the filter acts": Case(near, Mode.FILTERED),
+        "the filter acts": Case(stop, Mode.FILTERED),
     }
 
 
