@@ -1,4 +1,4 @@
-"""The two networks of a bundle, run by onnxruntime."""
+"""The two networks of a bundle, run by onnxruntime as one graph."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import onnxruntime
 from numpy.typing import NDArray
 
-from models import Bundle
+from models import Bundle, BundleError
 from monitor.errors import NetworkError
 from system.compiled import entry
 
@@ -18,7 +18,7 @@ class Networks:
     """Policy and multiplier network of one bundle.
 
     One intra-op thread without spinning: for networks this small a pool costs more than it computes, and
-    spinning takes the core that the robot's other software needs.
+    spinning takes the core that the robot's other software needs. What both compute is computed once.
 
     Args:
         bundle: a checked bundle.
@@ -29,8 +29,10 @@ class Networks:
 
     def __init__(self, bundle: Bundle) -> None:
         self.observation_size = bundle.manifest.observation_size
-        self._policy = _session(bundle.policy, "policy.onnx")
-        self._multiplier = _session(bundle.multiplier, "multiplier.onnx")
+        try:
+            self._sessions = [_session("joined", bundle.joined())]
+        except (BundleError, NetworkError):  # each by itself: it runs, or is named
+            self._sessions = [_session("policy", bundle.policy), _session("multiplier", bundle.multiplier)]
 
     def run(self, observation: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The nominal action and the risk score; either may be NaN or Inf, and the caller decides what then.
@@ -42,21 +44,19 @@ class Networks:
             nominal action [N, 2] and risk score λ_ξ(s) [N] (paper eq. 14).
         """
         feed = {"observation": observation.astype(np.float32)}
-        action = self._policy.run(["action"], feed)[0]
-        risk = self._multiplier.run(["multiplier"], feed)[0]
+        action, risk = [output for session in self._sessions for output in session.run(None, feed)]
         return action.astype(np.float64), risk.astype(np.float64)
 
 
-def _session(graph: bytes, name: str) -> onnxruntime.InferenceSession:
+def _session(name: str, graph: bytes) -> onnxruntime.InferenceSession:
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
-    options.inter_op_num_threads = 1
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.log_severity_level = 3
     try:
         return onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"])
     except Exception as error:
-        raise NetworkError(f"{name}: onnxruntime refuses it: {' '.join(str(error).split())}") from error
+        raise NetworkError(f"{name}.onnx: onnxruntime refuses it: {' '.join(str(error).split())}") from error
 
 
 @entry
