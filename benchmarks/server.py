@@ -1,4 +1,4 @@
-"""Latency and throughput of `POST /act` beside a bare FastAPI echo of the same body, in one run.
+"""Latency and throughput of `POST /act` beside a bare FastAPI echo of the same body, and the call in process.
 
     python -m benchmarks.server models/NAME
 
@@ -9,6 +9,7 @@ else the machine does hits both. The client is a raw socket: it measures the ser
 from __future__ import annotations
 
 import json
+import math
 import socket
 import sys
 import threading
@@ -27,10 +28,9 @@ from pydantic import BaseModel
 from rich.console import Console
 from rich.table import Table
 
-from decision import PLAN_STEPS
+from decision import PLAN_STEPS, Mode, memory_from_json
 from evaluation.service import Service
-from models import Bundle
-from monitor import GateName
+from monitor import GateName, Monitor
 from pointgoal.lidar import encode
 from pointgoal.observation import layout
 from server.serve import listen
@@ -39,7 +39,10 @@ from server.serve import listen
 class Echo(BaseModel):
     """The bare endpoint's body and reply."""
 
+    request: int
     observation: list[float]
+    hazards: list[list[float]] | None = None
+    memory: dict[str, Any] | None = None
 
 
 @dataclass(frozen=True)
@@ -48,13 +51,13 @@ class ServerBenchmark:
 
     bundle: Annotated[Path, tyro.conf.Positional]
     """The bundle's folder."""
-    gate: GateName = "always"
+    gate: GateName = "risk"
     """When the filter is active."""
     requests: int = 2000
-    """Requests a round and connection."""
+    """Requests a round."""
     rounds: int = 5
     """Rounds; the median over rounds is printed."""
-    connections: int = 4
+    clients: tuple[int, ...] = (1, 8, 64)
     """Connections at once for the throughput."""
 
 
@@ -68,8 +71,8 @@ class Connection:
         head = f"POST {address.path} HTTP/1.1\r\nhost: {address.netloc}\r\ncontent-type: application/json\r\n"
         self._request = f"{head}content-length: {len(body)}\r\n\r\n".encode() + body
 
-    def exchange(self) -> None:
-        """One request and its whole reply; raises RuntimeError if it is not a 200."""
+    def exchange(self) -> bytes:
+        """One request; its reply's body. Raises RuntimeError if it is not a 200."""
         self._socket.sendall(self._request)
         reply = b""
         while b"\r\n\r\n" not in reply:
@@ -80,6 +83,7 @@ class Connection:
         length = int(head.lower().split(b"content-length:", 1)[1].split(b"\r\n", 1)[0])
         while len(body) < length:
             body += self._receive()
+        return body
 
     def times(self, requests: int) -> list[float]:
         """Seconds of each of some requests."""
@@ -116,48 +120,91 @@ def throughput(url: str, body: bytes, connections: int, requests: int) -> float:
     return connections * requests / elapsed
 
 
-def measure(targets: dict[str, tuple[str, bytes]], config: ServerBenchmark) -> dict[str, dict[str, float]]:
-    """Median over rounds of p50 [µs], p99 [µs] and requests a second, for each of name → (url, body)."""
-    seen: dict[str, list[tuple[float, float, float]]] = {name: [] for name in targets}
-    for _ in range(config.rounds):
-        for name, (url, body) in targets.items():
-            connection = Connection(url, body)
-            connection.times(50)
-            p50, p99 = np.percentile(connection.times(config.requests), [50, 99]) * 1e6
-            connection.close()
-            seen[name].append((p50, p99, throughput(url, body, config.connections, config.requests // 4)))
-    names = ("p50_us", "p99_us", "requests_per_second")
+@dataclass(frozen=True)
+class Case:
+    """What is measured.
+
+    Attributes:
+        asked: the request's body.
+        mode: what the decision must be, or None for the echo: nobody wants to know how fast it falls back.
+    """
+
+    asked: dict[str, Any]
+    mode: Mode | None = None
+
+    @property
+    def body(self) -> bytes:
+        """As it goes over the wire."""
+        return json.dumps(self.asked).encode()
+
+
+def cases(level: int) -> dict[str, Case]:
+    """A robot at rest with a hazard in sight, and one that would drive into it."""
+    blocks = layout(level)
+    at_rest = np.zeros(blocks.size)
+    at_rest[blocks.slice("accelerometer")] = (0.0, 0.0, 9.81)
+    at_rest[blocks.slice("magnetometer")] = (0.0, -0.5, 0.0)
+    driving = at_rest.copy()
+    driving[blocks.slice("velocimeter")] = (0.8, 0.0, 0.0)
+    ahead = blocks.slice("goal_lidar").start
+    driving[[ahead, ahead + 1, ahead + 15]] = (0.5, 0.25, 0.25)
+    far, near = np.array([[[1.5, 1.2]]]), np.array([[[0.3, 0.03]]])
+    if "hazards_lidar" in blocks:
+        at_rest[blocks.slice("hazards_lidar")] = encode(far)[0]
+        driving[blocks.slice("hazards_lidar")] = encode(near)[0]
+    plan = {"side": 5, "guided": 0, "plan": [[0.05, 0.5]] * PLAN_STEPS}
+    plain = {"request": 1, "observation": at_rest.tolist()}
+    stop = {"request": 1, "observation": driving.tolist(), "hazards": near[0].tolist(), "memory": plan}
     return {
-        name: dict(zip(names, np.median(rows, axis=0).tolist(), strict=True)) for name, rows in seen.items()
+        "nominal": Case(plain, Mode.NOMINAL),
+        "nominal, a full memory": Case(plain | {"memory": plan}, Mode.NOMINAL),
+        "the filter acts": Case(stop, Mode.FILTERED),
     }
 
 
-def run(config: ServerBenchmark) -> dict[str, dict[str, float]]:
-    """Starts both services, measures them, stops them."""
-    where = layout(Bundle.load(config.bundle).manifest.level)
-    seen = np.random.default_rng(0).uniform(0.0, 0.6, where.size)
-    if "hazards_lidar" in where:
-        seen[where.slice("hazards_lidar")] = encode(np.array([[[1.5, 1.2]]]))[0]
-    observation = seen.tolist()
-    plain = json.dumps({"observation": observation}).encode()
-    given: dict[str, Any] = {
-        "observation": observation,
-        "hazards": [[1.0 + 0.2 * k, 0.3 * k] for k in range(8)],
-    }
-    plan = [[0.05, 0.5]] * PLAN_STEPS
-    driving = given | {"request": 1, "memory": {"side": 5, "guided": 0, "open": 0, "plan": plan}}
+def in_process(monitor: Monitor, asked: dict[str, Any], calls: int) -> tuple[float, float]:
+    """Median and 99th percentile of a decision in this process [µs]."""
+    memory = memory_from_json(asked["memory"]) if "memory" in asked else None
+    times = []
+    for _ in range(calls + 50):
+        started = time.perf_counter()
+        monitor.decide(asked["observation"], asked.get("hazards"), memory)
+        times.append(time.perf_counter() - started)
+    p50, p99 = np.percentile(times[50:], [50, 99]) * 1e6
+    return float(p50), float(p99)
+
+
+def over_http(url: str, case: Case, config: ServerBenchmark) -> list[float]:
+    """Median and 99th percentile [µs], and requests a second at each number of clients."""
+    connection = Connection(url, case.body)
+    if case.mode is not None and (mode := json.loads(connection.exchange())["mode"]) != case.mode:
+        raise RuntimeError(f"the decision is {mode}, expected {case.mode}")
+    connection.times(50)
+    p50, p99 = np.percentile(connection.times(config.requests), [50, 99]) * 1e6
+    connection.close()
+    rates = [throughput(url, case.body, n, max(1, config.requests // n)) for n in config.clients]
+    return [float(p50), float(p99), *rates]
+
+
+def run(config: ServerBenchmark) -> dict[str, list[float]]:
+    """Starts both services, measures them in turn, stops them; the medians over rounds."""
+    monitor = Monitor.load(config.bundle, config.gate)
+    measured = cases(monitor.bundle.manifest.level)
+    seen: dict[str, list[list[float]]] = {}
     with ExitStack() as stack:
         service = stack.enter_context(Service.start(config.bundle, config.gate))
         echo = stack.enter_context(Service.run([sys.executable, "-m", "benchmarks.server", "--echo"]))
-        return measure(
-            {
-                "bare FastAPI echo": (f"{echo.url}/echo", plain),
-                "POST /act, lidar": (f"{service.url}/act", plain),
-                "POST /act, 8 hazards": (f"{service.url}/act", json.dumps(given).encode()),
-                "POST /act, 8 hazards, a full memory": (f"{service.url}/act", json.dumps(driving).encode()),
-            },
-            config,
-        )
+        for _ in range(config.rounds):
+            for name, case in measured.items():
+                plain = Case(case.asked)
+                seen.setdefault(f"echo: {name}", []).append(over_http(f"{echo.url}/echo", plain, config))
+                seen.setdefault(f"in process: {name}", []).append(
+                    [*in_process(monitor, case.asked, config.requests), *[math.nan] * len(config.clients)]
+                )
+                seen.setdefault(f"POST /act: {name}", []).append(
+                    over_http(f"{service.url}/act", case, config)
+                )
+    return {name: np.median(rows, axis=0).tolist() for name, rows in seen.items()}
 
 
 def serve_echo() -> None:
@@ -181,10 +228,15 @@ def main() -> None:
         serve_echo()
         return
     config = tyro.cli(ServerBenchmark, prog="python -m benchmarks.server")
-    table = Table("", "p50 [µs]", "p99 [µs]", f"requests/s ({config.connections} connections)")
-    for name, row in run(config).items():
-        table.add_row(name, *(f"{value:,.0f}" for value in row.values()))
-    Console().print(table)
+    rows = run(config)
+    table = Table("", "p50 [µs]", "p99 [µs]", "p50 / echo", "p99 / echo")
+    for clients in config.clients:
+        table.add_column(f"requests/s, {clients} at once")
+    for name, (p50, p99, *rates) in rows.items():
+        echo50, echo99 = rows[f"echo: {name.partition(': ')[2]}"][:2]
+        told = (f"{rate:,.0f}" if math.isfinite(rate) else "" for rate in rates)
+        table.add_row(name, f"{p50:,.0f}", f"{p99:,.0f}", f"{p50 / echo50:.2f}", f"{p99 / echo99:.2f}", *told)
+    Console(width=120).print(table)
 
 
 if __name__ == "__main__":

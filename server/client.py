@@ -153,9 +153,12 @@ class Client:
             if status != http.client.OK:
                 raise ClientError(f"{url}: /model answered {status}: {_excerpt(content)}")
             model = ModelReply.model_validate_json(content)
+            _check_model(model)
         except ValidationError as error:
             raise ClientError(f"{url}: its /model is not that of a lagnet service") from error
-        except (OSError, ValueError, http.client.HTTPException) as error:
+        except ClientError:
+            raise
+        except Exception as error:  # whatever it is, the caller was promised a ClientError
             raise ClientError(f"{url}: {_excerpt(str(error) or type(error).__name__)}") from error
         served = [block.model_dump() for block in model.observation_layout]
         if layout is not None and served != [dict(block) for block in layout]:
@@ -200,7 +203,10 @@ class Client:
             ):
                 if told != expected:
                     raise ReplyError(f"the reply is of {name} {told}, not {expected}")
-            return self._checked(decision_of(reply))
+            decision = decision_of(reply)
+            if reply.gate_open != decision.gate_open:
+                raise ReplyError("the reply says both that its gate is open and that it is not")
+            return self._checked(decision)
         except BaseException:
             # Whoever sends one wrong reply may have others under way.
             self._link.close()
@@ -214,6 +220,8 @@ class Client:
                 raise ReplyError(f"the reply has {what} out of bounds")
         if decision.mode is Mode.NOMINAL and (decision.action != decision.nominal_action).any():
             raise ReplyError("the reply has another action than the nominal one and calls it nominal")
+        if decision.mode is Mode.NOMINAL and decision.origin is not None:
+            raise ReplyError(f"the reply is nominal and its action comes from the {decision.origin}")
         return decision
 
     def _note(self, kind: str, error: Exception) -> str:
@@ -244,5 +252,21 @@ def _numbers(name: str, values: ArrayLike) -> FloatArray:
     return array
 
 
+def _check_model(model: ModelReply) -> None:
+    """Raises ClientError for a service that no robot should follow, though its words are in order."""
+    low, high = model.action_low, model.action_high
+    if not all(-1.0 <= a <= 0.0 <= b <= 1.0 and a < b for a, b in zip(low, high, strict=True)):
+        raise ClientError(
+            f"{model.model} has actions from {low} to {high}: expected bounds in -1..1 around 0"
+        )
+    told = sum(block.size for block in model.observation_layout)
+    if told != model.observation_size:
+        raise ClientError(f"{model.model} wants {model.observation_size} numbers, and its layout has {told}")
+
+
 def _excerpt(text: str | bytes) -> str:
-    return (text.decode(errors="replace") if isinstance(text, bytes) else text)[:_EXCERPT]
+    """The beginning of a text from elsewhere, on one line: it goes into logs and terminals."""
+    beginning = (text[: 4 * _EXCERPT].decode(errors="replace") if isinstance(text, bytes) else text)[
+        :_EXCERPT
+    ]
+    return "".join(letter if letter.isprintable() else "?" for letter in beginning)

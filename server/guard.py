@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hmac
 import json
+from collections.abc import Mapping
 from contextlib import suppress
 
 from starlette.requests import ClientDisconnect
@@ -11,6 +12,9 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 OPEN_PATHS = frozenset({"/healthz", "/readyz"})
 """What an orchestrator may ask without a key."""
+
+AT_ONCE = "lagnet.at_once"
+"""The ASGI extension by which the server takes status and body of a JSON reply at once: True if it did."""
 
 _MAX_DIGITS = 18
 
@@ -26,12 +30,16 @@ class Guard:
         app: what it guards.
         api_key: the key that `Authorization: Bearer KEY` or `X-API-Key: KEY` must carry; None asks for none.
         max_body: most bytes of a request's body.
+        larger: path → most bytes of a body there, where that is more.
     """
 
-    def __init__(self, app: ASGIApp, api_key: str | None, max_body: int) -> None:
+    def __init__(
+        self, app: ASGIApp, api_key: str | None, max_body: int, larger: Mapping[str, int] | None = None
+    ) -> None:
         self._app = app
         self._key = None if api_key is None else api_key.encode()
         self._max_body = max_body
+        self._larger = larger or {}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Handles one connection."""
@@ -40,28 +48,39 @@ class Guard:
             return
         headers: dict[bytes, bytes] = dict(scope["headers"])
         if self._key is not None and scope["path"] not in OPEN_PATHS and not _carries(headers, self._key):
-            await _refuse(send, 401, "header", "authorization", "a valid API key is required")
+            await refuse(send, 401, "header", "authorization", "a valid API key is required")
             return
-        too_large = f"the body must not exceed {self._max_body} bytes"
-        stated = headers.get(b"content-length", b"0")
+        max_body = self._larger.get(scope["path"], self._max_body)
+        stated = headers.get(b"content-length", b"")
         # int() refuses thousands of digits.
-        if stated.isdigit() and (len(stated) > _MAX_DIGITS or int(stated) > self._max_body):
-            await _refuse(send, 413, "body", "content-length", too_large)
+        if stated.isdigit() and (len(stated) > _MAX_DIGITS or int(stated) > max_body):
+            await refuse(send, 413, "body", "content-length", _too_large(max_body))
             return
-        received = 0
-
-        async def limited() -> Message:
-            nonlocal received
-            message = await receive()
-            if message["type"] == "http.request":
-                received += len(message.get("body", b""))
-                if received > self._max_body:
-                    raise BodyTooLargeError(too_large)
-            return message
-
+        if not stated.isdigit() or b"transfer-encoding" in headers:
+            receive = _limited(receive, max_body)
         # Who hangs up in the middle of a body gets no reply, and leaves no traceback in the log.
         with suppress(ClientDisconnect):
-            await self._app(scope, limited, send)
+            await self._app(scope, receive, send)
+
+
+def _too_large(max_body: int) -> str:
+    return f"the body must not exceed {max_body} bytes"
+
+
+def _limited(receive: Receive, max_body: int) -> Receive:
+    """Counts what comes of a body whose length was not stated."""
+    received = 0
+
+    async def limited() -> Message:
+        nonlocal received
+        message = await receive()
+        if message["type"] == "http.request":
+            received += len(message.get("body", b""))
+            if received > max_body:
+                raise BodyTooLargeError(_too_large(max_body))
+        return message
+
+    return limited
 
 
 def _carries(headers: dict[bytes, bytes], key: bytes) -> bool:
@@ -70,12 +89,15 @@ def _carries(headers: dict[bytes, bytes], key: bytes) -> bool:
     return hmac.compare_digest(given, key)
 
 
-async def _refuse(send: Send, status: int, place: str, name: str, message: str) -> None:
+async def refuse(send: Send, status: int, place: str, name: str, message: str) -> None:
+    """Answers a request that is not read, and closes its connection."""
     detail = [{"loc": [place, name], "msg": message, "type": "refused"}]
     body = json.dumps({"detail": detail}).encode()
     headers = [(b"content-type", b"application/json"), (b"content-length", str(len(body)).encode())]
     if status == 401:
         headers.append((b"www-authenticate", b"Bearer"))
+    if status == 503:
+        headers.append((b"retry-after", b"1"))
     # The body was not read: the connection cannot carry another request.
     headers.append((b"connection", b"close"))
     await send({"type": "http.response.start", "status": status, "headers": headers})

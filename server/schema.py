@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import fields
+from types import GenericAlias
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, Self, get_type_hints
 
 import numpy as np
@@ -27,6 +28,10 @@ Pair = Annotated[list[Finite], Field(min_length=2, max_length=2)]
 RequestNumber = Annotated[int, Field(strict=True, ge=0, lt=2**63)]
 MAX_HAZARDS = 1000
 """Most hazards a request may name."""
+MAX_ROBOTS = 256
+"""Most robots of a batch."""
+HazardIndex = Annotated[int, Field(strict=True, ge=0, lt=2 * MAX_HAZARDS)]
+"""The request's hazards are counted first, then what the lidar shows."""
 
 
 class MemoryJson(BaseModel):
@@ -120,10 +125,11 @@ def _memory(value: MemoryJson) -> np.void:
     return memory
 
 
-_AS_IT_IS = (Mode, bool, Origin | None, OpenedBy | None, int | None, str | None)
+_AS_IT_IS = (Mode, bool, Origin | None, OpenedBy | None, str | None)
 _WIRE: dict[Any, Wire] = {
     FloatArray: Wire(Pair | None, _finite_pair, _pair),
     float: Wire(Finite | None, _finite, _number),
+    int | None: Wire(HazardIndex | None),
     np.void: Wire(MemoryJson, memory_to_json, _memory),
     **{kind: Wire(kind) for kind in _AS_IT_IS},
 }
@@ -171,6 +177,37 @@ def reply_of(decision: Decision, request: int, model: str, gate: str, seconds: f
         **told, gate_open=decision.gate_open, gate=gate, model=model, request=request, seconds=seconds
     )
     return reply
+
+
+class BatchRequest(BaseModel):
+    """The body of `POST /act/batch`.
+
+    Attributes:
+        robots: for each robot the body of a `POST /act`.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    robots: Annotated[list[Any], Field(min_length=1, max_length=MAX_ROBOTS)]
+
+
+class Refusal(BaseModel):
+    """The answer to a robot whose request is not in order, as `POST /act` gives it with status 422.
+
+    Attributes:
+        detail: what is wrong with it.
+    """
+
+    detail: list[dict[str, Any]]
+
+
+_REPLIES: dict[str, Any] = {"replies": (GenericAlias(list, (ActReply | Refusal,)), ...)}
+
+BatchReply = create_model(
+    "BatchReply",
+    __doc__="The reply of `POST /act/batch`: for each robot, in order, the reply of `POST /act`.",
+    **_REPLIES,
+)
 
 
 def decision_of(reply: Reply) -> Decision:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import gc
 import ipaddress
 import json
 import math
@@ -22,11 +24,12 @@ from command import command, settings
 from models import BundleError
 from monitor import DEFAULT_STRENGTH, GateName, Monitor, MonitorError, Strength
 from server.app import MAX_BODY, Lifecycle, create_app
+from server.door import Connection, Door, Patience
 
 KEY_VARIABLE = "LAGNET_API_KEY"
 """Environment variable that may hold the key."""
-_IDLE = 75
-"""How long a robot's connection may be idle before it is closed [s]."""
+_OTHER_FILES = 64
+"""Files that are open beside the connections."""
 _LAST_WORDS = 5
 """How long requests in flight may take once the service has closed its door [s]."""
 
@@ -60,7 +63,12 @@ class ServeConfig:
     max_body: int = MAX_BODY
     """Most bytes of a request's body; more is refused with 413."""
     max_connections: int = 512
-    """Connections and requests above this are answered 503 at once."""
+    """Most robots' connections; where there are more, the one that was idle longest is closed, and while none
+    is idle, further ones are answered 503. As many again may have asked for nothing yet."""
+    read_seconds: float = 5.0
+    """How long a new connection may be silent, a request may take to arrive, and a reply to be taken [s]."""
+    idle_seconds: float = 75.0
+    """How long a connection may be silent between two requests [s]."""
     drain_seconds: float = 0.5
     """How long /readyz says 503 before the service stops accepting connections [s]."""
 
@@ -70,6 +78,9 @@ class ServeConfig:
             raise ServeError(f"--port must be 0 to 65535, got {self.port}")
         if self.max_body < 1 or self.max_connections < 1:
             raise ServeError("--max-body and --max-connections must be at least 1")
+        for flag, seconds in (("--read-seconds", self.read_seconds), ("--idle-seconds", self.idle_seconds)):
+            if not (math.isfinite(seconds) and seconds > 0.0):
+                raise ServeError(f"{flag} must be finite and above 0, got {seconds}")
         if not (math.isfinite(self.drain_seconds) and self.drain_seconds >= 0.0):
             raise ServeError(f"--drain-seconds must be finite and at least 0, got {self.drain_seconds}")
 
@@ -82,12 +93,19 @@ class DrainingServer(uvicorn.Server):
         lifecycle: shared with the app.
         drain_seconds: how long it says so [s].
         announcement: a line for stdout, written once it listens and stops in order when told to.
+        door: who may stay connected.
     """
 
     def __init__(
-        self, config: uvicorn.Config, lifecycle: Lifecycle, drain_seconds: float, announcement: str
+        self,
+        config: uvicorn.Config,
+        lifecycle: Lifecycle,
+        drain_seconds: float,
+        announcement: str,
+        door: Door,
     ) -> None:
         super().__init__(config)
+        self.server_state = self._door = door
         self._lifecycle = lifecycle
         self._drain_seconds = drain_seconds
         self._announcement = announcement
@@ -108,6 +126,7 @@ class DrainingServer(uvicorn.Server):
 
     async def on_tick(self, counter: int) -> bool:
         """Asked ten times a second whether to stop."""
+        self._door.sweep(asyncio.get_running_loop().time())
         if self._stop_at is not None and time.monotonic() >= self._stop_at:
             self.should_exit = True
         return await super().on_tick(counter)
@@ -155,6 +174,26 @@ def read_api_key(path: Path | None) -> str | None:
     return key
 
 
+def allow_files(connections: int) -> None:
+    """Allows this process as many open files as so many robots and newcomers take.
+
+    Raises:
+        ServeError: if the system does not.
+    """
+    if sys.platform == "win32":
+        return
+    import resource
+
+    wanted = 2 * connections + _OTHER_FILES
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if hard != resource.RLIM_INFINITY and hard < wanted:
+        raise ServeError(
+            f"--max-connections {connections} takes {wanted} open files, {hard} are allowed (ulimit -n)"
+        )
+    if soft != resource.RLIM_INFINITY and soft < wanted:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+
+
 def serve(config: ServeConfig) -> None:
     """Serves until told to stop.
 
@@ -165,6 +204,7 @@ def serve(config: ServeConfig) -> None:
     """
     config.check()
     api_key = read_api_key(config.api_key_file)
+    allow_files(config.max_connections)
     listener = listen(config.host, config.port, api_key)
     with listener:
         monitor = Monitor.load(config.bundle, config.gate, config.threshold, guide=config.guide)
@@ -175,6 +215,9 @@ def serve(config: ServeConfig) -> None:
         ready = {"event": "listening", "url": url, "host": host, "port": port, "model": monitor.bundle.id}
         gate = {"gate": monitor.gate.name, "threshold": monitor.gate.threshold, "guide": config.guide}
         announcement = json.dumps(ready | gate)
+        # What is loaded stays: looking through it again and again for garbage would hold up decisions.
+        gc.collect()
+        gc.freeze()
         _server(app, lifecycle, config, announcement).run(sockets=[listener])
 
 
@@ -186,11 +229,12 @@ def _server(app: ASGIApp, lifecycle: Lifecycle, config: ServeConfig, announcemen
         lifespan="off",
         ws="none",
         server_header=False,
-        timeout_keep_alive=_IDLE,
-        limit_concurrency=config.max_connections,
+        http=Connection,
+        timeout_keep_alive=math.ceil(config.idle_seconds),
         timeout_graceful_shutdown=_LAST_WORDS,
     )
-    return DrainingServer(settings, lifecycle, config.drain_seconds, announcement)
+    door = Door(Patience(config.read_seconds, config.idle_seconds, config.max_connections))
+    return DrainingServer(settings, lifecycle, config.drain_seconds, announcement, door)
 
 
 def main() -> None:

@@ -7,7 +7,7 @@ import logging
 import socket
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -15,12 +15,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from decision import MEMORY, PLAN_STEPS, Decision
+from decision import MEMORY, PLAN_STEPS, Decision, Faults
 from evaluation.service import Service
 from pointgoal.observation import layout
 from server import Client, ClientError
-from server.link import MAX_REPLY
-from server.schema import reply_of
+from server.link import MAX_REPLY, DeadlineSocket
+from server.schema import ModelReply, reply_of
 
 Act = Callable[[socket.socket, bytes], None]
 
@@ -118,6 +118,11 @@ def in_turn(*behaviours: Act) -> Act:
     return behaviour
 
 
+def by_number(*behaviours: Act) -> Act:
+    """Answers the first request with the first behaviour, and so on, whether or not the others arrive."""
+    return lambda connection, asked: behaviours[json.loads(asked)["request"] - 1](connection, asked)
+
+
 def planned(actions: list[list[float]] = PLAN) -> np.void:
     """A robot's memory that holds a plan."""
     memory = np.zeros(1, MEMORY)
@@ -205,6 +210,11 @@ def test_a_service_that_misbehaves_leaves_the_robot_with_its_plan_in_time(
         ({"memory": {"side": 10**30, "guided": 0, "open": 0, "plan": []}}, "memory.side"),
         ({"model": "other@000000000000"}, "of model other@000000000000"),
         ({"gate": "off"}, "of gate off"),
+        ({"gate_open": False}, "both that its gate is open and that it is not"),
+        ({"opened_by": None}, "both that its gate is open and that it is not"),
+        ({"origin": "barrier"}, "comes from the barrier"),
+        ({"hazard": -1}, "not one"),
+        ({"hazard": 10**30}, "not one"),
         ({"threshold": 0.6}, "of threshold 0.6"),
         ({"threshold": None}, "of threshold nan"),
         ({"request": 99}, "of request 99"),
@@ -251,7 +261,7 @@ def twice(connection: socket.socket, asked: bytes) -> None:
 
 def test_a_reply_that_comes_twice_answers_one_request(fake, monitor, observation) -> None:
     last = replies(action=[0.0, 0.25], mode="filtered", origin="barrier")
-    with fake(monitor, in_turn(twice, replies(), last)) as url, Client(url, timeout=5.0) as client:
+    with fake(monitor, by_number(twice, replies(), last)) as url, Client(url, timeout=5.0) as client:
         assert client.decide(observation).reason is None
         time.sleep(0.4)
         assert_fallback(client.decide(observation, memory=planned()), "of request 1, not 2", PLAN[0], left=2)
@@ -506,6 +516,122 @@ def test_a_service_that_is_not_there_is_an_error_at_connect(url: str) -> None:
 def test_what_is_no_lagnet_service_is_an_error_at_connect(fake, monitor, model: bytes) -> None:
     with fake(monitor, replies(), model) as url, pytest.raises(ClientError):
         Client(url)
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"action_high": [1e300, 1.0]}, "bounds in -1..1"),
+        ({"action_low": [-1.0, -1.5]}, "bounds in -1..1"),
+        ({"action_low": [0.9, -1.0]}, "bounds in -1..1"),
+        ({"action_low": [0.0, -1.0], "action_high": [0.0, 1.0]}, "bounds in -1..1"),
+        ({"action_low": [1.0, 1.0], "action_high": [-1.0, -1.0]}, "bounds in -1..1"),
+        ({"observation_size": 59}, "its layout has 60"),
+        ({"observation_size": 10**30}, "its layout has 60"),
+        ({"observation_layout": []}, "its layout has 0"),
+    ],
+)
+def test_a_model_that_no_robot_should_follow_is_refused_at_connect(fake, monitor, changes, named) -> None:
+    told = json.loads(ModelReply.of(monitor).model_dump_json()) | changes
+    with fake(monitor, replies(), http(json.dumps(told).encode())) as url:
+        with pytest.raises(ClientError, match=named) as caught:
+            Client(url)
+        assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "error", [MemoryError(), RecursionError("deep"), OverflowError("large"), KeyError("x"), UnicodeError("x")]
+)
+def test_whatever_is_raised_at_connect_is_one_error(monkeypatch, error) -> None:
+    def broken(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr("server.link.Link.exchange", broken)
+    with pytest.raises(ClientError, match="http://x"):
+        Client("http://x")
+
+
+def test_what_a_service_says_cannot_write_log_lines(fake, monitor, observation, caplog) -> None:
+    bad = http(b"x\nWARNING all is well\x1b[2J\r\n", "500 Internal")
+    with fake(monitor, says(bad)) as url, Client(url, timeout=5.0) as client:
+        reason = client.decide(observation).reason
+        assert "all is well" in reason
+        assert reason.isprintable()
+        assert all(record.getMessage().isprintable() for record in caplog.records)
+    with fake(monitor, replies(), bad) as url:
+        with pytest.raises(ClientError) as caught:
+            Client(url)
+        assert str(caught.value).isprintable()
+
+
+def garbled(reply: bytes) -> Iterator[bytes]:
+    """A reply that is wrong at one place, for every place."""
+    for k in range(len(reply)):
+        yield reply[:k]
+        yield reply[:k] + reply[k + 1 :]
+        for byte in (b"\x00", b"\xff", b"9", b"-", b"\n", b"]", b"{"):
+            yield reply[:k] + byte + reply[k + 1 :]
+            yield reply[:k] + byte + reply[k:]
+
+
+@pytest.fixture
+def wired(monkeypatch) -> Callable[[bytes], None]:
+    """Makes every new connection one that brings a given reply, whatever is asked, and then ends."""
+    replies: list[bytes] = []
+
+    def opened(*_: object) -> DeadlineSocket:
+        here, there = socket.socketpair()
+        with there:
+            there.sendall(replies[-1])
+            there.shutdown(socket.SHUT_WR)
+            here.settimeout(1.0)
+            kept.append(there.dup())
+        return DeadlineSocket(here.family, here.type, here.proto, here.detach())
+
+    kept: list[socket.socket] = []
+    monkeypatch.setattr("server.link._open", opened)
+
+    def bring(reply: bytes) -> None:
+        replies.append(reply)
+        while kept:
+            kept.pop().close()
+
+    return bring
+
+
+def test_a_reply_garbled_anywhere_is_survived(wired, monitor, observation) -> None:
+    about = http(ModelReply.of(monitor).model_dump_json().encode())
+    wired(about)
+    client = Client("http://127.0.0.1:1", timeout=5.0)
+    client.faults = Faults("lagnet.test")
+    body = json.dumps(good(b'{"request": 1}')).encode()
+    nominal = 0
+    for reply in (*garbled(http(body)), *map(http, garbled(body))):
+        client._link.close()
+        client._request = 0
+        wired(reply)
+        decision = client.decide(observation, memory=planned())
+        assert (np.abs(decision.action) <= 1.0).all()
+        assert (np.abs(decision.memory["plan"]) <= 1.0).all()
+        if decision.reason is not None:
+            assert decision.action.tolist() == PLAN[0]
+        nominal += decision.reason is None
+    assert 0 < nominal < sum(client.faults.counts.values())
+    assert client.faults.internal() == 0
+
+
+def test_a_model_garbled_anywhere_is_survived_at_connect(wired, monitor) -> None:
+    body = ModelReply.of(monitor).model_dump_json().encode()
+    refused = 0
+    for reply in (*list(garbled(http(body)))[:1500], *map(http, list(garbled(body))[::7])):
+        wired(reply)
+        try:
+            with Client("http://127.0.0.1:1", timeout=5.0) as client:
+                assert (np.abs(client._low) <= 1.0).all()
+                assert (np.abs(client._high) <= 1.0).all()
+        except ClientError:
+            refused += 1
+    assert refused > 1000
 
 
 @pytest.mark.parametrize("timeout", [0.0, -1.0, float("nan"), float("inf")])

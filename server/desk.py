@@ -1,0 +1,232 @@
+"""Where decisions are asked for: `POST /act` for one robot, `POST /act/batch` for many."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from functools import partial
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ValidationError
+from pydantic_core import from_json
+from starlette.requests import ClientDisconnect
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from decision import MEMORY, Decision, Memory, memory_from_json
+from monitor import Monitor
+from server.guard import AT_ONCE, BodyTooLargeError
+from server.schema import ActRequest, BatchReply, BatchRequest, ModelReply, Refusal, Reply, reply_of
+
+FloatArray = NDArray[np.float64]
+
+ACT, BATCH = "/act", "/act/batch"
+_MAX_ERRORS = 8
+_QUICK = 0.005
+"""A decision within this time is made at once [s]: a health check may wait for it."""
+_QUICK_ENOUGH = 20
+"""So many quick ones in a row, and the next is expected to be quick."""
+
+Answer = tuple[int, bytes]
+"""Status and body."""
+Problem = tuple[list[str | int], str, str]
+"""Where in the body, what is wrong, and its kind."""
+Validated = TypeVar("Validated", bound=BaseModel)
+
+
+class RefusedError(ValueError):
+    """A request that cannot be decided about.
+
+    Attributes:
+        errors: what is wrong with it.
+    """
+
+    def __init__(self, errors: list[Problem]) -> None:
+        super().__init__(errors)
+        self.errors = errors
+
+
+class Desk:
+    """Answers `POST /act` and `POST /act/batch`, and hands everything else on.
+
+    A decision takes a fraction of a millisecond and is made at once; another thread would cost as much again.
+    While decisions are slow, and until they have been seen to be quick, they are made in a thread, so that
+    health checks do not wait for them.
+
+    Args:
+        app: what answers the other paths.
+        monitor: what decides.
+        model: what it told of itself.
+    """
+
+    def __init__(self, app: ASGIApp, monitor: Monitor, model: ModelReply) -> None:
+        self._app = app
+        self._monitor = monitor
+        self._model = model
+        self._thread = ThreadPoolExecutor(1, "decisions")
+        self._quick = 0
+        self._answers = {ACT: self._one, BATCH: self._batch}
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Handles one request."""
+        answers = self._answers.get(scope["path"]) if scope["type"] == "http" else None
+        if answers is None or scope["method"] != "POST":
+            await self._app(scope, receive, send)
+            return
+        started = time.perf_counter()
+        try:
+            content = await _body(receive)
+        except BodyTooLargeError as error:
+            status, answer = _problem(413, [([], str(error), "too_large")])
+        else:
+            if self._quick >= _QUICK_ENOUGH and scope["path"] == ACT:
+                status, answer = answers(content, started)
+            else:
+                loop = asyncio.get_running_loop()
+                status, answer = await loop.run_in_executor(self._thread, answers, content, started)
+        await _reply(scope, send, status, answer)
+
+    def _one(self, content: bytes, started: float) -> Answer:
+        """Answers the body of `POST /act`."""
+        begun = time.perf_counter()
+        answer = self._guarded(lambda: self._decide(content, started))
+        self._quick = self._quick + 1 if time.perf_counter() - begun < _QUICK else 0
+        return answer
+
+    def _batch(self, content: bytes, started: float) -> Answer:
+        """Answers the body of `POST /act/batch`."""
+        return self._guarded(lambda: self._decide_batch(content, started))
+
+    def _guarded(self, decide: Callable[[], BaseModel]) -> Answer:
+        try:
+            return 200, decide().model_dump_json().encode()
+        except RefusedError as error:
+            return _problem(422, error.errors)
+        except Exception as error:  # noqa: BLE001 - counted and logged; the client has a fallback of its own
+            self._monitor.faults.note(type(error).__name__, "the decision could not be told", error)
+            return _problem(500, [([], "internal error", "internal")])
+
+    def _decide(self, content: bytes, started: float) -> Reply:
+        asked, memory = self._read(lambda: ActRequest.model_validate_json(content))
+        decision = self._monitor.decide(asked.observation, asked.hazards, memory)
+        return self._told(decision, asked, started)
+
+    def _decide_batch(self, content: bytes, started: float) -> BaseModel:
+        """One call of the monitor for all robots whose requests are in order; the others are told why not."""
+        replies: list[Reply | Refusal] = []
+        rows: list[tuple[int, ActRequest, Memory | None]] = []
+        batch = _validated(lambda: BatchRequest.model_validate(_parsed(content)))
+        for place, robot in enumerate(batch.robots):
+            try:
+                rows.append((place, *self._read(partial(ActRequest.model_validate, robot))))
+                replies.append(Refusal(detail=[]))
+            except RefusedError as error:
+                replies.append(Refusal(detail=_detail(error.errors)))
+        if rows:
+            decisions = self._monitor.decide_batch(
+                np.array([asked.observation for _, asked, _ in rows]),
+                _hazards([asked.hazards or [] for _, asked, _ in rows]),
+                np.concatenate([np.zeros(1, MEMORY) if memory is None else memory for _, _, memory in rows]),
+            )
+            most = max(len(asked.hazards or []) for _, asked, _ in rows)
+            for row, (place, asked, _) in enumerate(rows):
+                decision = _of_its_own(decisions[row], len(asked.hazards or []), most)
+                replies[place] = self._told(decision, asked, started)
+        reply: BaseModel = BatchReply(replies=replies)
+        return reply
+
+    def _read(self, validate: Callable[[], ActRequest]) -> tuple[ActRequest, Memory | None]:
+        """One robot's request, and its memory.
+
+        Raises:
+            RefusedError: if it cannot be decided about.
+        """
+        asked = _validated(validate)
+        size = self._model.observation_size
+        if len(asked.observation) != size:
+            message = f"must have {size} numbers, got {len(asked.observation)}"
+            raise RefusedError([(["observation"], message, "wrong_length")])
+        try:
+            return asked, None if asked.memory is None else memory_from_json(asked.memory.model_dump())
+        except ValueError as error:
+            raise RefusedError([(["memory"], str(error), "wrong_memory")]) from error
+
+    def _told(self, decision: Decision, asked: ActRequest, started: float) -> Reply:
+        seconds = time.perf_counter() - started
+        return reply_of(decision, asked.request, self._model.model, self._model.gate, seconds)
+
+
+def _validated(validate: Callable[[], Validated]) -> Validated:
+    try:
+        return validate()
+    except ValidationError as error:
+        where = [(list(item["loc"]), item["msg"], item["type"]) for item in error.errors()]
+        raise RefusedError(where) from error
+
+
+def _parsed(content: bytes) -> Any:
+    try:
+        return from_json(content)
+    except ValueError as error:
+        raise RefusedError([([], f"Invalid JSON: {error}", "json_invalid")]) from error
+
+
+def _hazards(given: list[list[list[float]]]) -> FloatArray:
+    """Hazards (N, n, 2); rows of NaN stand for none."""
+    hazards = np.full((len(given), max(map(len, given)), 2), np.nan)
+    for row, places in enumerate(given):
+        hazards[row, : len(places)] = np.reshape(places, (-1, 2))
+    return hazards
+
+
+def _of_its_own(decision: Decision, given: int, most: int) -> Decision:
+    """The decision with its hazard counted among the robot's own: what the lidar shows comes after them."""
+    if decision.hazard is None or decision.hazard < most or given == most:
+        return decision
+    return replace(decision, hazard=decision.hazard - most + given)
+
+
+async def _body(receive: Receive) -> bytes:
+    """A request's body.
+
+    Raises:
+        BodyTooLargeError: if it is.
+        ClientDisconnect: if its sender hangs up.
+    """
+    parts = []
+    more = True
+    while more:
+        message = await receive()
+        if message["type"] == "http.disconnect":
+            raise ClientDisconnect
+        parts.append(message.get("body", b""))
+        more = message.get("more_body", False)
+    return parts[0] if len(parts) == 1 else b"".join(parts)
+
+
+async def _reply(scope: Scope, send: Send, status: int, content: bytes) -> None:
+    """Sends JSON; in one packet where the server can."""
+    at_once = scope.get("extensions", {}).get(AT_ONCE)
+    if at_once is not None and at_once(status, content):
+        return
+    headers = [(b"content-type", b"application/json"), (b"content-length", b"%d" % len(content))]
+    await send({"type": "http.response.start", "status": status, "headers": headers})
+    await send({"type": "http.response.body", "body": content})
+
+
+def _problem(status: int, errors: list[Problem]) -> Answer:
+    """An error in FastAPI's form."""
+    return status, json.dumps({"detail": _detail(errors)}).encode()
+
+
+def _detail(errors: list[Problem]) -> list[dict[str, Any]]:
+    """The input is left out: it may be NaN or very long."""
+    return [
+        {"loc": ["body", *where], "msg": message, "type": kind}
+        for where, message, kind in errors[:_MAX_ERRORS]
+    ]

@@ -1,0 +1,250 @@
+"""Who may stay connected: whoever is silent, slow, or does not read goes, and never at a robot's cost.
+
+uvicorn counts every open socket against one limit and waits for a request's bytes for as long as they take:
+a few hundred connections that say nothing would shut out every robot. Here each connection has a deadline for
+what it owes, and where there are too many, the one that was heard of longest ago makes room.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, cast
+
+import httptools
+from uvicorn._types import ASGIReceiveCallable, ASGISendCallable, Scope
+from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol, RequestResponseCycle
+from uvicorn.server import ServerState
+
+from server.guard import AT_ONCE, OPEN_PATHS, refuse
+
+MAX_HEAD = 65536
+"""Most bytes that may come before a request's head is whole; a robot's has 200."""
+
+MAX_AHEAD = 32
+"""Most requests that a connection may send ahead of its answers; a robot sends none."""
+
+_OPEN_PATHS = frozenset(path.encode() for path in OPEN_PATHS)
+_TOO_SLOW = b"HTTP/1.1 408 Request Timeout\r\ncontent-length: 0\r\nconnection: close\r\n\r\n"
+_HEAD_TOO_LARGE = (
+    b"HTTP/1.1 431 Request Header Fields Too Large\r\ncontent-length: 0\r\nconnection: close\r\n\r\n"
+)
+
+
+@dataclass(frozen=True)
+class Patience:
+    """How long and how many are waited for.
+
+    Attributes:
+        read: how long a new connection may take to its first byte, a request from its first byte to its last,
+            and a reply to be taken [s].
+        idle: how long a connection may be silent between two requests [s].
+        robots: most connections that have brought a request; as many again may be new.
+    """
+
+    read: float = 5.0
+    idle: float = 75.0
+    robots: int = 512
+
+
+class Door(ServerState):
+    """The open connections of one service.
+
+    A connection is a newcomer until it brings a whole request for more than a health check, which needs no
+    key; from then on it is a robot's. Newcomers only ever displace newcomers.
+
+    Args:
+        patience: the limits.
+    """
+
+    def __init__(self, patience: Patience) -> None:
+        super().__init__()
+        self.patience = patience
+        # Both in order: whoever came, or was answered, longest ago is first.
+        self._newcomers: dict[Connection, None] = {}
+        self._robots: dict[Connection, None] = {}
+
+    def enter(self, connection: Connection) -> None:
+        """Lets a new connection in; the oldest newcomer makes room."""
+        _make_room(self._newcomers, self.patience.robots)
+        self._newcomers[connection] = None
+
+    def heard(self, connection: Connection, checks: bool) -> None:
+        """A whole request has come; ``checks``: it is a health check."""
+        if connection in self._robots:
+            del self._robots[connection]
+            self._robots[connection] = None
+            return
+        self._newcomers.pop(connection, None)
+        if checks:
+            self._newcomers[connection] = None
+        else:
+            _make_room(self._robots, self.patience.robots)
+            self._robots[connection] = None
+
+    def full(self, connection: Connection) -> bool:
+        """Whether there is no room for one more robot: all of them await their answers."""
+        return (
+            len(self._robots) >= self.patience.robots
+            and connection not in self._robots
+            and _longest_idle(self._robots) is None
+        )
+
+    def leave(self, connection: Connection) -> None:
+        """A connection is closed."""
+        self._newcomers.pop(connection, None)
+        self._robots.pop(connection, None)
+
+    def sweep(self, now: float) -> None:
+        """Closes the connections whose deadline has passed.
+
+        Args:
+            now: on the event loop's clock [s].
+        """
+        for connection in cast(set[Connection], self.connections).copy():
+            if connection.deadline < now:
+                connection.turn_away()
+
+
+class Connection(HttpToolsProtocol):
+    """uvicorn's connection, with a deadline for what the other side owes.
+
+    Attributes:
+        deadline: when it is closed, on the event loop's clock [s].
+    """
+
+    deadline = math.inf
+    _reading = False
+    """Whether a request has begun and not all of it has come."""
+    _head = 0
+    """How many bytes of its head have come; -1 once the head is whole."""
+    _checks = False
+    """Whether it is a health check."""
+
+    @property
+    def awaits_answer(self) -> bool:
+        """Whether a whole request has come and is not answered yet."""
+        cycle = self.cycle
+        return cycle is not None and not cycle.more_body and not cycle.response_complete
+
+    def connection_made(self, transport: Any) -> None:
+        """A new connection."""
+        super().connection_made(transport)
+        self._allow(self._door.patience.read)
+        self._door.enter(self)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """It is closed, by whichever side."""
+        self._door.leave(self)
+        super().connection_lost(exc)
+
+    def data_received(self, data: bytes) -> None:
+        """Some bytes have come."""
+        super().data_received(data)
+        if self._reading and self._head >= 0:
+            self._head += len(data)
+            if self._head > MAX_HEAD and not self.transport.is_closing():
+                self.transport.write(_HEAD_TOO_LARGE)
+                self.transport.close()
+
+    def on_message_begin(self) -> None:
+        """The first byte of a request."""
+        self._reading, self._head = True, 0
+        self._allow(self._door.patience.read)
+        super().on_message_begin()
+
+    def on_headers_complete(self) -> None:
+        """The request's head has come whole."""
+        self._head = -1
+        if len(self.pipeline) >= MAX_AHEAD:
+            # uvicorn would keep them all, however many come.
+            raise httptools.HttpParserError("too many requests ahead of their answers")
+        self._checks = self.url.partition(b"?")[0] in _OPEN_PATHS
+        self.app = _busy if not self._checks and self._door.full(self) else self.config.loaded_app
+        super().on_headers_complete()
+        at_once: Any = partial(self._at_once, self.cycle)
+        self.scope["extensions"] = {AT_ONCE: at_once}
+
+    def on_message_complete(self) -> None:
+        """The request has come whole: from here on it is we who are slow."""
+        self._reading = False
+        self._allow(math.inf)
+        self._door.heard(self, self._checks)
+        super().on_message_complete()
+
+    def on_response_complete(self) -> None:
+        """The answer is on its way."""
+        # A request may be answered before all of it has come, and the next one may have begun.
+        if not self._reading:
+            self._allow(self._door.patience.idle)
+        super().on_response_complete()
+
+    def pause_writing(self) -> None:
+        """The other side does not take what it is sent."""
+        self._allow(self._door.patience.read)
+        super().pause_writing()
+
+    def resume_writing(self) -> None:
+        """It does again."""
+        super().resume_writing()
+        if self.awaits_answer:
+            self._allow(math.inf)
+        else:
+            self._allow(self._door.patience.read if self._reading else self._door.patience.idle)
+
+    def turn_away(self) -> None:
+        """Closes the connection, with a word to whoever is in the middle of a request."""
+        if self.transport.is_closing() or self.transport.get_write_buffer_size():
+            # What is unsent would keep it open for as long as the other side does not take it.
+            self.transport.abort()
+            return
+        if self._reading and self._has_its_say():
+            self.transport.write(_TOO_SLOW)
+        self.transport.close()
+
+    def _at_once(self, cycle: RequestResponseCycle, status: int, content: bytes) -> bool:
+        """Answers a request with JSON in one packet; uvicorn would send head and body apart."""
+        if cycle.disconnected or self.flow.write_paused:
+            return False
+        head = [STATUS_LINE[status], *(b"%b: %b\r\n" % header for header in cycle.default_headers)]
+        if not cycle.keep_alive:
+            head.append(b"connection: close\r\n")
+        head.append(b"content-type: application/json\r\ncontent-length: %d\r\n\r\n" % len(content))
+        cycle.response_started = cycle.response_complete = True
+        self.transport.write(b"".join([*head, content]))
+        cycle.message_event.set()
+        if not cycle.keep_alive:
+            self.transport.close()
+        cycle.on_response()
+        return True
+
+    def _has_its_say(self) -> bool:
+        """Whether the next word to the other side is the answer to the request that is being read."""
+        if self.cycle is None or self._head >= 0:
+            return self.cycle is None or self.cycle.response_complete
+        return not self.cycle.response_started and not self.pipeline
+
+    def _allow(self, seconds: float) -> None:
+        """Sets the deadline, unless it is one for taking what was sent."""
+        if not self.flow.write_paused:
+            self.deadline = self.loop.time() + seconds
+
+    @property
+    def _door(self) -> Door:
+        return cast(Door, self.server_state)
+
+
+async def _busy(scope: Scope, receive: ASGIReceiveCallable, send: ASGISendCallable) -> None:
+    await refuse(cast(Any, send), 503, "connection", "limit", "every connection awaits its answer")
+
+
+def _longest_idle(connections: dict[Connection, None]) -> Connection | None:
+    return next((connection for connection in connections if not connection.awaits_answer), None)
+
+
+def _make_room(connections: dict[Connection, None], most: int) -> None:
+    """Makes room for one more, if one of them can go."""
+    if len(connections) >= most and (idle := _longest_idle(connections)) is not None:
+        del connections[idle]
+        idle.turn_away()

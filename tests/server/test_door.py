@@ -1,0 +1,318 @@
+"""Connections that say nothing, or a byte now and then, do not cost a robot its answer."""
+
+from __future__ import annotations
+
+import asyncio
+import http.client
+import json
+import select
+import socket
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+
+import pytest
+import uvicorn
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from evaluation.service import Service
+from server import Client
+from server.app import Lifecycle
+from server.door import MAX_HEAD, Connection, Door, Patience
+from server.serve import DrainingServer, ServeConfig, ServeError, allow_files, listen, serve
+
+READ, IDLE = 1.0, 3.0
+ACT = b"POST /act HTTP/1.1\r\nhost: x\r\n"
+HEALTH = b"GET /healthz HTTP/1.1\r\nhost: x\r\n\r\n"
+
+Connect = Callable[..., socket.socket]
+
+
+@pytest.fixture(scope="module")
+def service(tiny_bundle: Path) -> Iterator[Service]:
+    command = [sys.executable, "-m", "server.serve", str(tiny_bundle), "--port", "0"]
+    command += ["--read-seconds", str(READ), "--idle-seconds", str(IDLE), "--max-connections", "512"]
+    with Service.run(command) as running:
+        yield running
+
+
+@pytest.fixture
+def connect(service: Service) -> Iterator[Connect]:
+    """Opens a connection to the service, or to another port."""
+    with ExitStack() as opened:
+
+        def one(port: int = 0) -> socket.socket:
+            there = ("127.0.0.1", port or int(service.url.rsplit(":", 1)[1]))
+            return opened.enter_context(socket.create_connection(there, timeout=10.0))
+
+        yield one
+
+
+def act(observation: list[float]) -> bytes:
+    body = json.dumps({"observation": observation}).encode()
+    return ACT + f"content-length: {len(body)}\r\n\r\n".encode() + body
+
+
+def answered(connection: socket.socket, request: bytes) -> http.client.HTTPResponse:
+    connection.sendall(request)
+    reply = http.client.HTTPResponse(connection)
+    reply.begin()
+    reply.read()
+    return reply
+
+
+def closed(connection: socket.socket, seconds: float) -> bool:
+    """Whether the other side closes the connection in time; what it says before is dropped."""
+    end = time.monotonic() + seconds
+    while (left := end - time.monotonic()) > 0.0:
+        if select.select([connection], [], [], left)[0]:
+            try:
+                if not connection.recv(65536):
+                    return True
+            except ConnectionError:
+                return True
+    return False
+
+
+def test_silent_connections_starve_nobody(connect: Connect, observation) -> None:
+    robot = connect()
+    assert answered(robot, act(observation)).status == 200
+    silent = [connect() for _ in range(600)]
+    # The robot that was there, one that comes now, and the orchestrator.
+    for request, link in (
+        (act(observation), robot),
+        (act(observation), connect()),
+        (HEALTH, connect()),
+        (HEALTH.replace(b"healthz", b"readyz"), connect()),
+    ):
+        started = time.monotonic()
+        assert answered(link, request).status == 200
+        assert time.monotonic() - started < 0.5
+    assert all(closed(link, 2.0 * READ) for link in silent)
+    assert answered(robot, act(observation)).status == 200
+
+
+def test_half_requests_starve_nobody(connect: Connect, observation) -> None:
+    """As silent ones: connections that owe the rest of a head or of a body hold no place."""
+    for begun in (ACT, ACT + b"content-length: 1000\r\n\r\n{"):
+        for _ in range(300):
+            connect().sendall(begun)
+    started = time.monotonic()
+    assert answered(connect(), act(observation)).status == 200
+    assert answered(connect(), HEALTH).status == 200
+    assert time.monotonic() - started < 0.5
+
+
+def test_whoever_sends_a_byte_now_and_then_is_closed_in_time(connect: Connect, observation) -> None:
+    whole = act(observation)
+    drips = {
+        "nothing but line ends": (b"", b"\r\n"),
+        "request line": (b"POST /", b"x"),
+        "head": (ACT, b"x"),
+        "body": (ACT + b"content-length: 1000\r\n\r\n", b" "),
+        "chunked body": (ACT + b"transfer-encoding: chunked\r\n\r\n", b"1\r\n \r\n"),
+        "head after an answer": (whole + ACT, b"x"),
+        "body after an answer": (whole + ACT + b"content-length: 1000\r\n\r\n", b" "),
+        "body of what is answered already": (
+            b"POST /healthz HTTP/1.1\r\nhost: x\r\ntransfer-encoding: chunked\r\n\r\n",
+            b"1\r\n \r\n",
+        ),
+        "line ends after an answer": (whole, b"\r\n"),
+    }
+    links = {name: connect() for name in drips}
+    for name, link in links.items():
+        link.sendall(drips[name][0])
+        link.setblocking(False)
+    started = time.monotonic()
+    lasted: dict[str, float] = {}
+    said = dict.fromkeys(drips, b"")
+    while len(lasted) < len(drips) and time.monotonic() - started < 3.0 * IDLE:
+        for name in drips.keys() - lasted.keys():
+            try:
+                links[name].send(drips[name][1])
+                received = links[name].recv(65536)
+                said[name] += received
+                gone = not received
+            except BlockingIOError:
+                gone = False
+            except ConnectionError:
+                gone = True
+            if gone:
+                lasted[name] = time.monotonic() - started
+        time.sleep(0.05)
+    assert lasted.keys() == drips.keys()
+    between = lasted.pop("line ends after an answer")
+    assert IDLE - 0.2 < between < IDLE + 1.0
+    assert all(READ - 0.2 < seconds < READ + 1.0 for seconds in lasted.values()), lasted
+    assert said["head"].startswith(b"HTTP/1.1 408 ")
+    assert said["body after an answer"].count(b"HTTP/1.1 200 OK") == 1
+    assert b"HTTP/1.1 408 " in said["body after an answer"]
+
+
+def test_a_robot_that_keeps_its_connection_keeps_it(connect: Connect, observation) -> None:
+    robot = connect()
+    for pause in (0.3, 0.3, 0.3, 0.3, READ + 0.3, 0.7 * IDLE, 0.0):
+        assert answered(robot, act(observation)).status == 200
+        time.sleep(pause)
+    assert not closed(robot, 0.1)
+    assert closed(robot, IDLE + 1.0)
+
+
+def test_whoever_asks_far_ahead_of_the_answers_is_closed(connect: Connect, observation) -> None:
+    link = connect()
+    link.sendall(HEALTH * 10)
+    said = b""
+    while said.count(b"HTTP/1.1 200 OK") < 10:
+        said += link.recv(65536)
+    with suppress(ConnectionError):
+        link.sendall(HEALTH * 20_000)
+    assert closed(link, READ)
+    assert answered(connect(), act(observation)).status == 200
+
+
+def test_a_head_without_end_is_refused(connect: Connect) -> None:
+    link = connect()
+    with pytest.raises(ConnectionError):  # noqa: PT012
+        link.sendall(ACT)
+        for _ in range(100 * MAX_HEAD // 1000):
+            link.sendall(b"x: " + b"y" * 995 + b"\r\n")
+            time.sleep(0.001)
+        link.recv(1)
+
+
+@pytest.fixture(scope="module")
+def small(tiny_bundle: Path) -> Iterator[int]:
+    """The port of a service for four robots."""
+    command = [
+        sys.executable,
+        "-m",
+        "server.serve",
+        str(tiny_bundle),
+        "--port",
+        "0",
+        "--max-connections",
+        "4",
+    ]
+    with Service.run(command) as running:
+        yield int(running.url.rsplit(":", 1)[1])
+
+
+def test_the_robot_that_was_idle_longest_makes_room(small: int, connect: Connect, observation) -> None:
+    robots = [connect(small) for _ in range(4)]
+    for robot in robots:
+        assert answered(robot, act(observation)).status == 200
+    assert answered(robots[0], act(observation)).status == 200
+    assert answered(connect(small), act(observation)).status == 200
+    assert closed(robots[1], 1.0)
+    for robot in (robots[0], *robots[2:]):
+        assert answered(robot, act(observation)).status == 200
+
+
+def test_health_checks_cost_no_robot_its_connection(small: int, connect: Connect, observation) -> None:
+    """They need no key: whoever can reach the service can make as many as they like."""
+    robots = [connect(small) for _ in range(4)]
+    for robot in robots:
+        assert answered(robot, act(observation)).status == 200
+    for _ in range(20):
+        assert answered(connect(small), HEALTH).status == 200
+    for robot in robots:
+        assert answered(robot, act(observation)).status == 200
+
+
+def test_a_client_whose_idle_connection_is_taken_connects_anew(
+    small: int, connect: Connect, observation
+) -> None:
+    with Client(f"http://127.0.0.1:{small}", timeout=5.0) as client:
+        client.decide(observation)
+        for _ in range(4):
+            assert answered(connect(small), act(observation)).status == 200
+        client.decide(observation)
+        assert not client.faults.counts
+
+
+@contextmanager
+def serving(app: ASGIApp, patience: Patience, listener: socket.socket) -> Iterator[int]:
+    """Runs an app behind a door, in a thread; its port."""
+    settings = uvicorn.Config(app, http=Connection, ws="none", lifespan="off", log_level="warning")
+    server = DrainingServer(settings, Lifecycle(), 0.0, "", Door(patience))
+    thread = threading.Thread(target=server.run, args=([listener],))
+    thread.start()
+    try:
+        yield listener.getsockname()[1]
+    finally:
+        server.should_exit = True
+        thread.join()
+
+
+async def reply(send: Send, body: bytes) -> None:
+    headers = [(b"content-length", str(len(body)).encode())]
+    await send({"type": "http.response.start", "status": 200, "headers": headers})
+    await send({"type": "http.response.body", "body": body})
+
+
+def test_while_every_robot_awaits_its_answer_others_are_told_to_come_back(connect: Connect) -> None:
+    answer = threading.Event()
+
+    async def slow(scope: Scope, receive: Receive, send: Send) -> None:
+        while scope["path"] == "/act" and not answer.is_set():
+            await asyncio.sleep(0.01)
+        await reply(send, b"")
+
+    try:
+        with serving(slow, Patience(robots=2), listen("127.0.0.1", 0, None)) as port:
+            waiting = [connect(port) for _ in range(2)]
+            for robot in waiting:
+                robot.sendall(act([0.0]))
+            time.sleep(0.3)
+            late = answered(connect(port), act([0.0]))
+            assert (late.status, late.getheader("retry-after")) == (503, "1")
+            assert answered(connect(port), HEALTH).status == 200
+            answer.set()
+            for robot in waiting:
+                assert answered(robot, b"").status == 200
+            assert answered(connect(port), act([0.0])).status == 200
+    finally:
+        answer.set()
+
+
+@pytest.mark.parametrize("requests", [1, 2])
+def test_whoever_does_not_take_the_reply_is_closed_in_time(connect: Connect, requests: int) -> None:
+    """It would hold the reply, and the next request, in memory for as long as it likes."""
+
+    async def large(scope: Scope, receive: Receive, send: Send) -> None:
+        await reply(send, bytes(20_000_000))
+
+    with serving(large, Patience(read=0.5), listen("127.0.0.1", 0, None)) as port:
+        taker = connect(port)
+        assert answered(taker, HEALTH).status == 200
+        link = connect(port)
+        for _ in range(requests):
+            link.sendall(HEALTH)
+            time.sleep(0.1)
+        time.sleep(1.0)
+        received = 0
+        with suppress(ConnectionError):
+            while part := link.recv(1_000_000):
+                received += len(part)
+        assert received < 20_000_000
+        assert answered(taker, HEALTH).status == 200
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), float("inf")])
+@pytest.mark.parametrize("name", ["read_seconds", "idle_seconds"])
+def test_deadlines_that_are_none_are_refused(tiny_bundle: Path, name: str, value: float) -> None:
+    with pytest.raises(ServeError, match=f"--{name.replace('_', '-')}"):
+        serve(ServeConfig(tiny_bundle, port=0, **{name: value}))
+
+
+def test_more_connections_than_open_files_are_refused() -> None:
+    resource = pytest.importorskip("resource")
+    before = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if before[1] == resource.RLIM_INFINITY:
+        pytest.skip("there is no limit")
+    with pytest.raises(ServeError, match="--max-connections"):
+        allow_files(before[1])
+    assert resource.getrlimit(resource.RLIMIT_NOFILE) == before
