@@ -152,7 +152,7 @@ def cases(level: int) -> dict[str, Case]:
     if "hazards_lidar" in blocks:
         at_rest[blocks.slice("hazards_lidar")] = encode(far)[0]
         driving[blocks.slice("hazards_lidar")] = encode(near)[0]
-    plan = {"side": 5, "guided": 0, "plan": [[0.05, 0.5]] * PLAN_STEPS}
+    plan = {"side": 5, "guided": 0, "open": 0, "plan": [[0.05, 0.5]] * PLAN_STEPS}
     plain = {"request": 1, "observation": at_rest.tolist()}
     stop = {"request": 1, "observation": driving.tolist(), "hazards": near[0].tolist(), "memory": plan}
     return {

@@ -7,11 +7,10 @@ from typing import Any
 
 from fastapi import FastAPI
 from fastapi.responses import JSONResponse
-from starlette.types import ASGIApp
 
 from monitor import Monitor
-from server.desk import ACT, BATCH, Desk
-from server.guard import Guard
+from server.desk import Desk
+from server.guard import ACT, BATCH, Guard
 from server.schema import MAX_ROBOTS, ActReply, ActRequest, BatchReply, ModelReply
 
 MAX_BODY = 65536
@@ -41,7 +40,7 @@ class Lifecycle:
 
 def create_app(
     monitor: Monitor, lifecycle: Lifecycle | None = None, api_key: str | None = None, max_body: int = MAX_BODY
-) -> ASGIApp:
+) -> Guard:
     """The service around one monitor that is loaded and warmed up.
 
     Args:

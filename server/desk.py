@@ -20,12 +20,11 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from decision import MEMORY, Decision, Memory, memory_from_json
 from monitor import Monitor
-from server.guard import AT_ONCE, BodyTooLargeError
+from server.guard import ACT, AT_ONCE, BATCH, BodyTooLargeError
 from server.schema import ActRequest, BatchReply, BatchRequest, ModelReply, Refusal, Reply, reply_of
 
 FloatArray = NDArray[np.float64]
 
-ACT, BATCH = "/act", "/act/batch"
 _MAX_ERRORS = 8
 _QUICK = 0.005
 """A decision within this time is made at once [s]: a health check may wait for it."""

@@ -8,16 +8,16 @@ what it owes, and where there are too many, the one that was heard of longest ag
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, cast
 
 import httptools
-from uvicorn._types import ASGIReceiveCallable, ASGISendCallable, Scope
 from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol, RequestResponseCycle
 from uvicorn.server import ServerState
 
-from server.guard import AT_ONCE, OPEN_PATHS, refuse
+from server.guard import AT_ONCE, FULL
 
 MAX_HEAD = 65536
 """Most bytes that may come before a request's head is whole; a robot's has 200."""
@@ -25,7 +25,6 @@ MAX_HEAD = 65536
 MAX_AHEAD = 32
 """Most requests that a connection may send ahead of its answers; a robot sends none."""
 
-_OPEN_PATHS = frozenset(path.encode() for path in OPEN_PATHS)
 _TOO_SLOW = b"HTTP/1.1 408 Request Timeout\r\ncontent-length: 0\r\nconnection: close\r\n\r\n"
 _HEAD_TOO_LARGE = (
     b"HTTP/1.1 431 Request Header Fields Too Large\r\ncontent-length: 0\r\nconnection: close\r\n\r\n"
@@ -40,7 +39,7 @@ class Patience:
         read: how long a new connection may take to its first byte, a request from its first byte to its last,
             and a reply to be taken [s].
         idle: how long a connection may be silent between two requests [s].
-        robots: most connections that have brought a request; as many again may be new.
+        robots: most connections of robots; as many again may have asked for no decision yet.
     """
 
     read: float = 5.0
@@ -51,16 +50,18 @@ class Patience:
 class Door(ServerState):
     """The open connections of one service.
 
-    A connection is a newcomer until it brings a whole request for more than a health check, which needs no
-    key; from then on it is a robot's. Newcomers only ever displace newcomers.
+    A connection is a newcomer until it brings a robot's whole request; from then on it is a robot's.
+    Newcomers only ever displace newcomers.
 
     Args:
         patience: the limits.
+        is_robots: whether a request, by its ASGI scope, is one that only a robot makes.
     """
 
-    def __init__(self, patience: Patience) -> None:
+    def __init__(self, patience: Patience, is_robots: Callable[[Mapping[str, Any]], bool]) -> None:
         super().__init__()
         self.patience = patience
+        self._is_robots = is_robots
         # Both in order: whoever came, or was answered, longest ago is first.
         self._newcomers: dict[Connection, None] = {}
         self._robots: dict[Connection, None] = {}
@@ -70,18 +71,15 @@ class Door(ServerState):
         _make_room(self._newcomers, self.patience.robots)
         self._newcomers[connection] = None
 
-    def heard(self, connection: Connection, checks: bool) -> None:
-        """A whole request has come; ``checks``: it is a health check."""
-        if connection in self._robots:
-            del self._robots[connection]
-            self._robots[connection] = None
-            return
-        self._newcomers.pop(connection, None)
-        if checks:
-            self._newcomers[connection] = None
-        else:
+    def heard(self, connection: Connection, scope: Mapping[str, Any]) -> None:
+        """A whole request has come."""
+        robot = connection in self._robots
+        self.leave(connection)
+        if robot or self._is_robots(scope):
             _make_room(self._robots, self.patience.robots)
             self._robots[connection] = None
+        else:
+            self._newcomers[connection] = None
 
     def full(self, connection: Connection) -> bool:
         """Whether there is no room for one more robot: all of them await their answers."""
@@ -119,8 +117,6 @@ class Connection(HttpToolsProtocol):
     """Whether a request has begun and not all of it has come."""
     _head = 0
     """How many bytes of its head have come; -1 once the head is whole."""
-    _checks = False
-    """Whether it is a health check."""
 
     @property
     def awaits_answer(self) -> bool:
@@ -160,17 +156,15 @@ class Connection(HttpToolsProtocol):
         if len(self.pipeline) >= MAX_AHEAD:
             # uvicorn would keep them all, however many come.
             raise httptools.HttpParserError("too many requests ahead of their answers")
-        self._checks = self.url.partition(b"?")[0] in _OPEN_PATHS
-        self.app = _busy if not self._checks and self._door.full(self) else self.config.loaded_app
         super().on_headers_complete()
-        at_once: Any = partial(self._at_once, self.cycle)
-        self.scope["extensions"] = {AT_ONCE: at_once}
+        extensions: dict[str, Any] = {AT_ONCE: partial(self._at_once, self.cycle)}
+        self.scope["extensions"] = extensions | {FULL: self._door.full(self)}
 
     def on_message_complete(self) -> None:
         """The request has come whole: from here on it is we who are slow."""
         self._reading = False
         self._allow(math.inf)
-        self._door.heard(self, self._checks)
+        self._door.heard(self, self.scope)
         super().on_message_complete()
 
     def on_response_complete(self) -> None:
@@ -233,10 +227,6 @@ class Connection(HttpToolsProtocol):
     @property
     def _door(self) -> Door:
         return cast(Door, self.server_state)
-
-
-async def _busy(scope: Scope, receive: ASGIReceiveCallable, send: ASGISendCallable) -> None:
-    await refuse(cast(Any, send), 503, "connection", "limit", "every connection awaits its answer")
 
 
 def _longest_idle(connections: dict[Connection, None]) -> Connection | None:

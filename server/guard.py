@@ -1,4 +1,4 @@
-"""What stands before every request, as pure ASGI: the key and the limit on the body's size."""
+"""What stands before every request, as pure ASGI: the key, a place, and the limit on the body's size."""
 
 from __future__ import annotations
 
@@ -6,15 +6,18 @@ import hmac
 import json
 from collections.abc import Mapping
 from contextlib import suppress
+from typing import Any
 
 from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+ACT, BATCH = "/act", "/act/batch"
 OPEN_PATHS = frozenset({"/healthz", "/readyz"})
 """What an orchestrator may ask without a key."""
-
 AT_ONCE = "lagnet.at_once"
 """The ASGI extension by which the server takes status and body of a JSON reply at once: True if it did."""
+FULL = "lagnet.full"
+"""The ASGI extension that says whether there is no place for one more robot."""
 
 _MAX_DIGITS = 18
 
@@ -24,7 +27,7 @@ class BodyTooLargeError(ValueError):
 
 
 class Guard:
-    """Refuses requests without the key (401) and with a body above the limit (413).
+    """Refuses requests without the key (401), without a place (503) and with a body above the limit (413).
 
     Args:
         app: what it guards.
@@ -47,20 +50,30 @@ class Guard:
             await self._app(scope, receive, send)
             return
         headers: dict[bytes, bytes] = dict(scope["headers"])
-        if self._key is not None and scope["path"] not in OPEN_PATHS and not _carries(headers, self._key):
-            await refuse(send, 401, "header", "authorization", "a valid API key is required")
+        if scope["path"] not in OPEN_PATHS and not self._admits(headers):
+            await _refuse(send, 401, "header", "authorization", "a valid API key is required")
+            return
+        if scope["path"] in (ACT, BATCH) and scope.get("extensions", {}).get(FULL):
+            await _refuse(send, 503, "connection", "limit", "every connection awaits its answer")
             return
         max_body = self._larger.get(scope["path"], self._max_body)
         stated = headers.get(b"content-length", b"")
         # int() refuses thousands of digits.
         if stated.isdigit() and (len(stated) > _MAX_DIGITS or int(stated) > max_body):
-            await refuse(send, 413, "body", "content-length", _too_large(max_body))
+            await _refuse(send, 413, "body", "content-length", _too_large(max_body))
             return
         if not stated.isdigit() or b"transfer-encoding" in headers:
             receive = _limited(receive, max_body)
         # Who hangs up in the middle of a body gets no reply, and leaves no traceback in the log.
         with suppress(ClientDisconnect):
             await self._app(scope, receive, send)
+
+    def is_robots(self, scope: Mapping[str, Any]) -> bool:
+        """Whether a request is one that only a robot makes: for a decision, with the key."""
+        return scope["path"] in (ACT, BATCH) and self._admits(dict(scope["headers"]))
+
+    def _admits(self, headers: Mapping[bytes, bytes]) -> bool:
+        return self._key is None or _carries(headers, self._key)
 
 
 def _too_large(max_body: int) -> str:
@@ -83,13 +96,13 @@ def _limited(receive: Receive, max_body: int) -> Receive:
     return limited
 
 
-def _carries(headers: dict[bytes, bytes], key: bytes) -> bool:
+def _carries(headers: Mapping[bytes, bytes], key: bytes) -> bool:
     scheme, _, bearer = headers.get(b"authorization", b"").partition(b" ")
     given = bearer.strip() if scheme.lower() == b"bearer" else headers.get(b"x-api-key", b"")
     return hmac.compare_digest(given, key)
 
 
-async def refuse(send: Send, status: int, place: str, name: str, message: str) -> None:
+async def _refuse(send: Send, status: int, place: str, name: str, message: str) -> None:
     """Answers a request that is not read, and closes its connection."""
     detail = [{"loc": [place, name], "msg": message, "type": "refused"}]
     body = json.dumps({"detail": detail}).encode()

@@ -7,6 +7,7 @@ as it likes. Here whatever is left of the deadline bounds the next read.
 from __future__ import annotations
 
 import http.client
+import select
 import socket
 import time
 from typing import Any
@@ -78,6 +79,10 @@ class Link:
                 `MAX_REPLY`.
         """
         deadline = time.monotonic() + timeout
+        if self._socket is not None and select.select([self._socket], [], [], 0.0)[0]:
+            # It was closed while it was idle, or something came that nobody had asked for: a reply to a
+            # request that is still to be sent would otherwise be taken for one.
+            self.close()
         kept = self._socket is not None
         try:
             return self._exchange(method, path, body, deadline)

@@ -18,13 +18,13 @@ from typing import Annotated
 
 import tyro
 import uvicorn
-from starlette.types import ASGIApp
 
 from command import command, settings
 from models import BundleError
 from monitor import DEFAULT_STRENGTH, GateName, Monitor, MonitorError, Strength
 from server.app import MAX_BODY, Lifecycle, create_app
 from server.door import Connection, Door, Patience
+from server.guard import Guard
 
 KEY_VARIABLE = "LAGNET_API_KEY"
 """Environment variable that may hold the key."""
@@ -221,11 +221,11 @@ def serve(config: ServeConfig) -> None:
         _server(app, lifecycle, config, announcement).run(sockets=[listener])
 
 
-def _server(app: ASGIApp, lifecycle: Lifecycle, config: ServeConfig, announcement: str) -> DrainingServer:
+def _server(app: Guard, lifecycle: Lifecycle, config: ServeConfig, announcement: str) -> DrainingServer:
     settings = uvicorn.Config(
         app,
         access_log=False,
-        log_level="warning",
+        log_level="error",  # warnings are of what anybody may send, a line each
         lifespan="off",
         ws="none",
         server_header=False,
@@ -233,7 +233,8 @@ def _server(app: ASGIApp, lifecycle: Lifecycle, config: ServeConfig, announcemen
         timeout_keep_alive=math.ceil(config.idle_seconds),
         timeout_graceful_shutdown=_LAST_WORDS,
     )
-    door = Door(Patience(config.read_seconds, config.idle_seconds, config.max_connections))
+    patience = Patience(config.read_seconds, config.idle_seconds, config.max_connections)
+    door = Door(patience, app.is_robots)
     return DrainingServer(settings, lifecycle, config.drain_seconds, announcement, door)
 
 

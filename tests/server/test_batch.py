@@ -13,7 +13,7 @@ from pointgoal.lidar import encode
 from server.app import create_app
 from server.schema import MAX_ROBOTS
 
-PLAN = {"side": 3, "guided": 1, "plan": [[-0.05, 0.25], [0.05, -1.0]]}
+PLAN = {"side": 3, "guided": 1, "open": 0, "plan": [[-0.05, 0.25], [0.05, -1.0]]}
 
 
 def robots(count: int) -> list[dict[str, object]]:
@@ -93,7 +93,7 @@ FAULTS = [
     (row("true"), ["body", "observation", 0]),
     (row("0", hazards="[[1e999, 0]]"), ["body", "hazards", 0, 0]),
     (row("0", memory=3), ["body", "memory"]),
-    (row("0", memory={"side": 0, "guided": 0, "plan": [[0, 2]]}), ["body", "memory"]),
+    (row("0", memory={"side": 0, "guided": 0, "open": 0, "plan": [[0, 2]]}), ["body", "memory"]),
     (row("0", surprise=1), ["body", "surprise"]),
 ]
 

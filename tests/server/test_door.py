@@ -10,9 +10,10 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 import pytest
 import uvicorn
@@ -233,11 +234,15 @@ def test_a_client_whose_idle_connection_is_taken_connects_anew(
         assert not client.faults.counts
 
 
+def asks_for_a_decision(scope: Mapping[str, Any]) -> bool:
+    return scope["path"] == "/act"
+
+
 @contextmanager
 def serving(app: ASGIApp, patience: Patience, listener: socket.socket) -> Iterator[int]:
     """Runs an app behind a door, in a thread; its port."""
     settings = uvicorn.Config(app, http=Connection, ws="none", lifespan="off", log_level="warning")
-    server = DrainingServer(settings, Lifecycle(), 0.0, "", Door(patience))
+    server = DrainingServer(settings, Lifecycle(), 0.0, "", Door(patience, asks_for_a_decision))
     thread = threading.Thread(target=server.run, args=([listener],))
     thread.start()
     try:
