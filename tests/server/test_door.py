@@ -23,6 +23,7 @@ from evaluation.service import Service
 from server import Client
 from server.app import Lifecycle
 from server.door import MAX_HEAD, Connection, Door, Patience
+from server.guard import Guard
 from server.serve import DrainingServer, ServeConfig, ServeError, allow_files, listen, serve
 
 READ, IDLE = 1.0, 3.0
@@ -266,8 +267,9 @@ def test_while_every_robot_awaits_its_answer_others_are_told_to_come_back(connec
             await asyncio.sleep(0.01)
         await reply(send, b"")
 
-    try:
-        with serving(slow, Patience(robots=2), listen("127.0.0.1", 0, None)) as port:
+    guarded = Guard(slow, None, 65536)
+    with serving(guarded, Patience(robots=2), listen("127.0.0.1", 0, None)) as port:
+        try:
             waiting = [connect(port) for _ in range(2)]
             for robot in waiting:
                 robot.sendall(act([0.0]))
@@ -279,8 +281,8 @@ def test_while_every_robot_awaits_its_answer_others_are_told_to_come_back(connec
             for robot in waiting:
                 assert answered(robot, b"").status == 200
             assert answered(connect(port), act([0.0])).status == 200
-    finally:
-        answer.set()
+        finally:
+            answer.set()
 
 
 @pytest.mark.parametrize("requests", [1, 2])
