@@ -261,9 +261,15 @@ def twice(connection: socket.socket, asked: bytes) -> None:
 
 def test_a_reply_that_comes_twice_answers_one_request(fake, monitor, observation) -> None:
     last = replies(action=[0.0, 0.25], mode="filtered", origin="barrier")
-    with fake(monitor, by_number(twice, replies(), last)) as url, Client(url, timeout=5.0) as client:
+    with fake(monitor, by_number(twice, last)) as url, Client(url, timeout=5.0) as client:
         assert client.decide(observation).reason is None
         time.sleep(0.4)
+        # What lies there unasked is not read as the next one's.
+        assert client.decide(observation).action.tolist() == [0.0, 0.25]
+    # One that comes while the next is awaited is told by its number.
+    again = replies(request=1)
+    with fake(monitor, by_number(replies(), again, last)) as url, Client(url, timeout=5.0) as client:
+        assert client.decide(observation).reason is None
         assert_fallback(client.decide(observation, memory=planned()), "of request 1, not 2", PLAN[0], left=2)
         assert client.decide(observation).action.tolist() == [0.0, 0.25]
     with fake(monitor, in_turn(twice_at_once, last)) as url, Client(url, timeout=5.0) as client:
