@@ -46,7 +46,7 @@ def services_of(bundle: Path) -> list[int]:
     return found
 
 
-@pytest.mark.parametrize("hazards", ["lidar", "given"])
+@pytest.mark.parametrize("hazards", ["lidar", pytest.param("given", marks=pytest.mark.long)])
 def test_the_service_decides_as_the_monitor(tiny_bundle: Path, always, hazards) -> None:
     here = run_episodes("PointGoal1-v0", always, 3, seed=2, hazards=hazards, record=True)
     with (
@@ -118,6 +118,7 @@ def test_an_evaluation_whose_service_dies_ends_with_status_1(
     assert not figures.exists()
 
 
+@pytest.mark.long
 def test_the_demo_drives_through_services_that_it_stops(tiny_bundle: Path, tmp_path: Path) -> None:
     out = tmp_path / "demo"
     result = command("evaluation.demo", tiny_bundle, "--out", out, "--episodes", 1)

@@ -154,6 +154,7 @@ def test_whoever_sends_a_byte_now_and_then_is_closed_in_time(connect: Connect, o
     assert b"HTTP/1.1 408 " in said["body after an answer"]
 
 
+@pytest.mark.long
 def test_a_robot_that_keeps_its_connection_keeps_it(connect: Connect, observation) -> None:
     robot = connect()
     for pause in (0.3, 0.3, 0.3, 0.3, READ + 0.3, 0.7 * IDLE, 0.0):

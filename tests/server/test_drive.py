@@ -66,7 +66,7 @@ def nonsense(connection: socket.socket) -> None:
     connection.sendall(b"HTTP/1.1 200 OK\r\ncontent-length: 100000000000000000000\r\n\r\n{")
 
 
-@pytest.mark.parametrize("fault", [hang_up, say_nothing, nonsense])
+@pytest.mark.parametrize("fault", [hang_up, pytest.param(say_nothing, marks=pytest.mark.long), nonsense])
 def test_no_violation_whenever_the_service_stops_answering(fake, tiny_bundle, fault) -> None:
     bundle = Bundle.load(tiny_bundle)
     monitor = Monitor(bundle, FullAhead(bundle), BarrierFilter(FilterConfig(robot=ROBOT)), "always")

@@ -64,6 +64,7 @@ def test_the_graphs_compute_what_torch_computes(run, bundle):
     assert (trained.multipliers(observation) >= 0).all()
 
 
+@pytest.mark.long
 def test_the_graphs_are_exact_for_a_policy_that_reacts_steeply(run):
     trained = TrainedRun(run)
     rng = np.random.default_rng(0)
@@ -83,6 +84,7 @@ def types(graph: bytes) -> set[int]:
     return {tensor.data_type for tensor in onnx.load_model_from_string(graph).graph.initializer}
 
 
+@pytest.mark.long
 def test_by_default_what_is_exported_warns(run, tmp_path, monkeypatch):
     monkeypatch.setattr(export, "WarningConfig", lambda episodes: WarningConfig(episodes, minibatches=50))
     asked = ExportConfig(run, tmp_path / "bundle", episodes=2, threads=1, warning_episodes=1)

@@ -184,6 +184,7 @@ def wait_for(condition, process):
         time.sleep(0.002)
 
 
+@pytest.mark.long
 def test_kill_at_ten_random_moments(whole_run, tmp_path):
     folder = tmp_path / "run"
     rng = random.Random(0)
