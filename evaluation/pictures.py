@@ -320,7 +320,7 @@ def _draw_over_time(
             parted.step * STEP_SECONDS, 1.02, "×", transform=gate_row.get_xaxis_transform(), ha="center"
         )
     cost.set_xlabel("time [s]", labelpad=1)
-    cost.legend(*risk.get_legend_handles_labels(), loc="upper left", ncols=len(drives), frameon=False)
+    cost.legend(*risk.get_legend_handles_labels(), loc="center right", ncols=len(drives), frameon=False)
 
 
 def _draw_gates(axes: Axes, drives: Mapping[str, Drive]) -> None:
