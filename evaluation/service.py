@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ctypes
 import json
 import os
 import select
+import signal
 import subprocess
 import sys
 import tempfile
@@ -20,11 +22,16 @@ from server.serve import KEY_VARIABLE
 
 _START_SECONDS = 180.0
 _STOP_SECONDS = 10.0
+# Looked up here: between fork and exec nothing may wait for a lock that another thread held.
+_PRCTL = ctypes.CDLL(None).prctl if sys.platform == "linux" else None
+_PR_SET_PDEATHSIG = 1
 
 
 @dataclass(frozen=True)
 class Service:
     """A running service; as a context manager it is stopped at the end, also on an error or Ctrl-C.
+
+    On Linux it also ends with the thread that started it, however that ends.
 
     Attributes:
         process: its process.
@@ -71,6 +78,7 @@ class Service:
             stderr=errors,
             text=True,
             start_new_session=True,
+            preexec_fn=end_with_parent,  # noqa: PLW1509  (it takes no lock)
             env=environment | {"OMP_NUM_THREADS": "1"},
         )
         try:
@@ -92,6 +100,12 @@ class Service:
     ) -> None:
         """Stops it."""
         self.stop()
+
+
+def end_with_parent() -> None:
+    """Run in a new process on Linux: SIGTERM comes when its parent is gone, by kill -9 for example."""
+    if _PRCTL is not None:
+        _PRCTL(_PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
 def _read_url(process: subprocess.Popen[str], errors: IO[str]) -> str:

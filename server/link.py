@@ -7,7 +7,6 @@ as it likes. Here whatever is left of the deadline bounds the next read.
 from __future__ import annotations
 
 import http.client
-import select
 import socket
 import time
 from typing import Any
@@ -79,7 +78,7 @@ class Link:
                 `MAX_REPLY`.
         """
         deadline = time.monotonic() + timeout
-        if self._socket is not None and select.select([self._socket], [], [], 0.0)[0]:
+        if self._socket is not None and not _silent(self._socket):
             # It was closed while it was idle, or something came that nobody had asked for: a reply to a
             # request that is still to be sent would otherwise be taken for one.
             self.close()
@@ -150,6 +149,18 @@ def _open(found: tuple[Any, ...], timeout: float) -> DeadlineSocket:
         opened.close()
         raise
     return opened
+
+
+def _silent(connection: socket.socket) -> bool:
+    """Whether nothing has come that was not read, the other side's end included."""
+    connection.setblocking(False)
+    try:
+        connection.recv(1, socket.MSG_PEEK)
+    except BlockingIOError:
+        return True
+    except OSError:
+        pass
+    return False
 
 
 def remaining(deadline: float) -> float:

@@ -161,6 +161,38 @@ def test_an_interrupted_demo_stops_its_service(
             os.kill(left, signal.SIGKILL)
 
 
+STARTS_A_SERVICE = """
+import sys, time
+from pathlib import Path
+from evaluation.service import Service
+service = Service.start(Path(sys.argv[1]), "off")
+print("started", flush=True)
+time.sleep(60.0)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the kernel does it")
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+def test_whoever_is_killed_leaves_no_service_behind(own_bundle: Path, number: signal.Signals) -> None:
+    owner = subprocess.Popen(
+        [sys.executable, "-c", STARTS_A_SERVICE, str(own_bundle)], stdout=subprocess.PIPE, text=True
+    )
+    try:
+        assert owner.stdout.readline() == "started\n"
+        assert len(services_of(own_bundle)) == 1
+        owner.send_signal(number)
+        owner.wait(10.0)
+        deadline = time.monotonic() + 10.0
+        while services_of(own_bundle):
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+    finally:
+        owner.kill()
+        owner.wait()
+        for left in services_of(own_bundle):
+            os.kill(left, signal.SIGKILL)
+
+
 def test_a_service_that_does_not_start_tells_why(own_bundle: Path) -> None:
     (own_bundle / "policy.onnx").unlink()
     with pytest.raises(ServiceError, match=r"policy\.onnx"):

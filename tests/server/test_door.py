@@ -10,23 +10,22 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import Any
 
 import pytest
 import uvicorn
-from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.types import Receive, Scope, Send
 
 from evaluation.service import Service
 from server import Client
-from server.app import Lifecycle
+from server.app import MAX_BODY, Lifecycle, create_app
 from server.door import MAX_HEAD, Connection, Door, Patience
 from server.guard import Guard
 from server.serve import DrainingServer, ServeConfig, ServeError, allow_files, listen, serve
 
-READ, IDLE = 1.0, 3.0
+READ, IDLE = 0.5, 1.5
 ACT = b"POST /act HTTP/1.1\r\nhost: x\r\n"
 HEALTH = b"GET /healthz HTTP/1.1\r\nhost: x\r\n\r\n"
 
@@ -36,7 +35,7 @@ Connect = Callable[..., socket.socket]
 @pytest.fixture(scope="module")
 def service(tiny_bundle: Path) -> Iterator[Service]:
     command = [sys.executable, "-m", "server.serve", str(tiny_bundle), "--port", "0"]
-    command += ["--read-seconds", str(READ), "--idle-seconds", str(IDLE), "--max-connections", "512"]
+    command += ["--read-seconds", str(READ), "--idle-seconds", str(IDLE), "--drain-seconds", "0"]
     with Service.run(command) as running:
         yield running
 
@@ -53,9 +52,10 @@ def connect(service: Service) -> Iterator[Connect]:
         yield one
 
 
-def act(observation: list[float]) -> bytes:
+def act(observation: list[float], key: str | None = None) -> bytes:
     body = json.dumps({"observation": observation}).encode()
-    return ACT + f"content-length: {len(body)}\r\n\r\n".encode() + body
+    head = "" if key is None else f"authorization: Bearer {key}\r\n"
+    return ACT + f"{head}content-length: {len(body)}\r\n\r\n".encode() + body
 
 
 def answered(connection: socket.socket, request: bytes) -> http.client.HTTPResponse:
@@ -157,7 +157,7 @@ def test_whoever_sends_a_byte_now_and_then_is_closed_in_time(connect: Connect, o
 @pytest.mark.long
 def test_a_robot_that_keeps_its_connection_keeps_it(connect: Connect, observation) -> None:
     robot = connect()
-    for pause in (0.3, 0.3, 0.3, 0.3, READ + 0.3, 0.7 * IDLE, 0.0):
+    for pause in (0.1, 0.1, 0.1, READ + 0.2, 0.7 * IDLE, 0.0):
         assert answered(robot, act(observation)).status == 200
         time.sleep(pause)
     assert not closed(robot, 0.1)
@@ -186,72 +186,83 @@ def test_a_head_without_end_is_refused(connect: Connect) -> None:
         link.recv(1)
 
 
-@pytest.fixture(scope="module")
-def small(tiny_bundle: Path) -> Iterator[int]:
-    """The port of a service for four robots."""
-    command = [
-        sys.executable,
-        "-m",
-        "server.serve",
-        str(tiny_bundle),
-        "--port",
-        "0",
-        "--max-connections",
-        "4",
-    ]
-    with Service.run(command) as running:
-        yield int(running.url.rsplit(":", 1)[1])
-
-
-def test_the_robot_that_was_idle_longest_makes_room(small: int, connect: Connect, observation) -> None:
-    robots = [connect(small) for _ in range(4)]
-    for robot in robots:
-        assert answered(robot, act(observation)).status == 200
-    assert answered(robots[0], act(observation)).status == 200
-    assert answered(connect(small), act(observation)).status == 200
-    assert closed(robots[1], 1.0)
-    for robot in (robots[0], *robots[2:]):
-        assert answered(robot, act(observation)).status == 200
-
-
-def test_health_checks_cost_no_robot_its_connection(small: int, connect: Connect, observation) -> None:
-    """They need no key: whoever can reach the service can make as many as they like."""
-    robots = [connect(small) for _ in range(4)]
-    for robot in robots:
-        assert answered(robot, act(observation)).status == 200
-    for _ in range(20):
-        assert answered(connect(small), HEALTH).status == 200
-    for robot in robots:
-        assert answered(robot, act(observation)).status == 200
-
-
-def test_a_client_whose_idle_connection_is_taken_connects_anew(
-    small: int, connect: Connect, observation
-) -> None:
-    with Client(f"http://127.0.0.1:{small}", timeout=5.0) as client:
-        client.decide(observation)
-        for _ in range(4):
-            assert answered(connect(small), act(observation)).status == 200
-        client.decide(observation)
-        assert not client.faults.counts
-
-
-def asks_for_a_decision(scope: Mapping[str, Any]) -> bool:
-    return scope["path"] == "/act"
-
-
 @contextmanager
-def serving(app: ASGIApp, patience: Patience, listener: socket.socket) -> Iterator[int]:
+def serving(app: Guard, patience: Patience) -> Iterator[int]:
     """Runs an app behind a door, in a thread; its port."""
-    settings = uvicorn.Config(app, http=Connection, ws="none", lifespan="off", log_level="warning")
-    server = DrainingServer(settings, Lifecycle(), 0.0, "", Door(patience, asks_for_a_decision))
-    thread = threading.Thread(target=server.run, args=([listener],))
+    settings = uvicorn.Config(app, http=Connection, ws="none", lifespan="off", log_level="error")
+    server = DrainingServer(settings, Lifecycle(), 0.0, "", Door(patience, app.is_robots))
+    listener = listen("127.0.0.1", 0, None)
+    thread = threading.Thread(target=server.run, args=([listener],), daemon=True)
     thread.start()
     try:
         yield listener.getsockname()[1]
     finally:
         server.should_exit = True
         thread.join()
+
+
+@pytest.fixture(scope="module", params=[None, "sesame"], ids=["no key", "key"])
+def key(request) -> str | None:
+    """The key that the service for four robots asks for."""
+    return request.param
+
+
+@pytest.fixture(scope="module")
+def small(monitor, key) -> Iterator[int]:
+    """The port of a service for four robots."""
+    with serving(create_app(monitor, api_key=key), Patience(robots=4)) as port:
+        yield port
+
+
+def test_the_robot_that_was_idle_longest_makes_room(small, key, connect: Connect, observation) -> None:
+    robots = [connect(small) for _ in range(4)]
+    for robot in (*robots, robots[0]):
+        assert answered(robot, act(observation, key)).status == 200
+    assert answered(connect(small), act(observation, key)).status == 200
+    assert closed(robots[1], 1.0)
+    for robot in (robots[0], *robots[2:]):
+        assert answered(robot, act(observation, key)).status == 200
+
+
+@pytest.mark.parametrize(
+    "path", ["/healthz", "/readyz", "/%68ealthz", "http://x/healthz", "/model", "/nothing", "/openapi.json"]
+)
+def test_whoever_asks_for_no_decision_costs_no_robot_its_connection(
+    small, key, connect: Connect, observation, path: str
+) -> None:
+    """Health checks need no key: whoever can reach the service can make as many as they like."""
+    robots = [connect(small) for _ in range(4)]
+    for robot in robots:
+        assert answered(robot, act(observation, key)).status == 200
+    for _ in range(20):
+        answered(connect(small), f"GET {path} HTTP/1.1\r\nhost: x\r\n\r\n".encode())
+    for robot in robots:
+        assert answered(robot, act(observation, key)).status == 200
+
+
+def test_whoever_has_not_the_key_costs_no_robot_its_connection(
+    small, key, connect: Connect, observation
+) -> None:
+    if key is None:
+        pytest.skip("nobody has one")
+    robots = [connect(small) for _ in range(4)]
+    for robot in robots:
+        assert answered(robot, act(observation, key)).status == 200
+    for wrong in (None, "", "Sesame", key + key) * 5:
+        assert answered(connect(small), act(observation, wrong)).status == 401
+    for robot in robots:
+        assert answered(robot, act(observation, key)).status == 200
+
+
+def test_a_client_whose_idle_connection_is_taken_connects_anew(
+    small, key, connect: Connect, observation
+) -> None:
+    with Client(f"http://127.0.0.1:{small}", timeout=5.0, api_key=key) as client:
+        client.decide(observation)
+        for _ in range(4):
+            assert answered(connect(small), act(observation, key)).status == 200
+        client.decide(observation)
+        assert not client.faults.counts
 
 
 async def reply(send: Send, body: bytes) -> None:
@@ -268,8 +279,7 @@ def test_while_every_robot_awaits_its_answer_others_are_told_to_come_back(connec
             await asyncio.sleep(0.01)
         await reply(send, b"")
 
-    guarded = Guard(slow, None, 65536)
-    with serving(guarded, Patience(robots=2), listen("127.0.0.1", 0, None)) as port:
+    with serving(Guard(slow, None, MAX_BODY), Patience(robots=2)) as port:
         try:
             waiting = [connect(port) for _ in range(2)]
             for robot in waiting:
@@ -293,14 +303,14 @@ def test_whoever_does_not_take_the_reply_is_closed_in_time(connect: Connect, req
     async def large(scope: Scope, receive: Receive, send: Send) -> None:
         await reply(send, bytes(20_000_000))
 
-    with serving(large, Patience(read=0.5), listen("127.0.0.1", 0, None)) as port:
+    with serving(Guard(large, None, MAX_BODY), Patience(read=0.3)) as port:
         taker = connect(port)
         assert answered(taker, HEALTH).status == 200
         link = connect(port)
         for _ in range(requests):
             link.sendall(HEALTH)
-            time.sleep(0.1)
-        time.sleep(1.0)
+            time.sleep(0.05)
+        time.sleep(0.6)
         received = 0
         with suppress(ConnectionError):
             while part := link.recv(1_000_000):

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from evaluation.service import Service
+from evaluation.service import Service, end_with_parent
 from models import BundleError
 from monitor import MonitorError
 from server import Client
@@ -86,7 +86,13 @@ def test_the_key_comes_from_the_file_or_the_environment(tmp_path: Path, monkeypa
 def test_a_stop_says_not_ready_first_and_finishes_what_is_in_flight(tiny_bundle: Path, observation) -> None:
     command = [*COMMAND, str(tiny_bundle), "--port", "0", "--gate", "risk", "--guide", "off"]
     command += ["--drain-seconds", "1.0"]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=end_with_parent,  # noqa: PLW1509
+    )
     try:
         assert select.select([process.stdout], [], [], 60.0)[0]
         said = json.loads(process.stdout.readline())
