@@ -1,8 +1,8 @@
 """What the networks cost: ``python -m benchmarks.networks``.
 
 Prints the time of a bundle's pair, as the monitor runs it, of its two files one by one, and of a plain pair:
-two perceptrons of 60 → 64 → 64 with tanh, of the observation itself, one file each. Below, whole decisions on
-the nominal path.
+two perceptrons of 60 → 64 → 64 with tanh, of the observation itself, one file each. Last, whole decisions
+with the gate open.
 """
 
 from __future__ import annotations
@@ -70,9 +70,9 @@ def in_turn(calls: dict[str, Callable[[], Any]], rounds: int, count: int) -> dic
 
 
 def observations(count: int) -> np.ndarray[Any, Any]:
-    """Real ones (count, 60), of robots at rest with nothing in their way of a decision."""
+    """Real ones (count, 60), of robots at the beginning of their episodes."""
     env = PointGoalVectorEnv(1, count)
-    observation, _ = env.reset(seed=seeds.rows(Use.SIMULATION_SPEED, 1, count))
+    observation, _ = env.reset(seed=seeds.rows(Use.NETWORK_SPEED, 0, count))
     env.close()
     return observation
 

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import pairwise
 from multiprocessing import get_context
 from pathlib import Path
@@ -215,11 +216,17 @@ def _workers(config: CalibrateConfig) -> Iterator[Callable[[Gate, int, Callable[
         yield run
 
 
+@lru_cache(maxsize=1)
+def _monitor(bundle: Path, gate: Gate, guide: Strength) -> Monitor:
+    """One a process: a gate's parts come one after the other."""
+    return Monitor.load(bundle, gate, guide=guide)
+
+
 def _episodes(
     config: CalibrateConfig, gate: Gate, first: int, count: int
 ) -> tuple[int, int, int, float, float]:
     """Episodes, those missed, those with a violation, open steps and summed return of one part."""
-    monitor = Monitor.load(config.bundle, gate, guide=config.guide)
+    monitor = _monitor(config.bundle, gate, config.guide)
     task = monitor.bundle.manifest.task
     done = run_episodes(task, monitor, count, config.seed, config.hazards, use=Use.GATE, first=first)
     missed = done.opened_by[OpenedBy.BARRIER] > 0

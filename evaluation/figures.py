@@ -18,13 +18,12 @@ from models import Bundle
 from monitor.networks import Networks
 from pointgoal import seeds
 from pointgoal.loop import drive
-from pointgoal.scene import PHYSICS_STEPS, TIMESTEP
+from pointgoal.scene import STEP_SECONDS
 from pointgoal.seeds import Use
 from pointgoal.vector import PointGoalVectorEnv
 
 FloatArray = NDArray[np.float64]
 
-STEP_SECONDS = TIMESTEP * PHYSICS_STEPS
 _TRIES = 50
 _ROWS = (("reward", "#0077b6"), ("cost", "#d62839"), ("λ", "#2a9d8f"))
 

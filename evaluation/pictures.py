@@ -24,11 +24,8 @@ from PIL import Image, ImageColor, ImageDraw, ImageFont
 from decision import Mode, OpenedBy
 from evaluation.closed_loop import FloatArray, TextArray, Trajectory
 from pointgoal.observation import HAZARD_RADIUS
-from pointgoal.scene import PHYSICS_STEPS, TIMESTEP
+from pointgoal.scene import STEP_SECONDS
 from pointgoal.simulation import GOAL_RADIUS
-
-STEP_SECONDS = TIMESTEP * PHYSICS_STEPS
-"""Duration of one step [s]."""
 
 _INK, _GREY, _PAPER, _PANEL = "#1b263b", "#8d99ae", "#ffffff", "#f7f8fa"
 _HAZARD, _HAZARD_EDGE = "#f6bdc0", "#d62839"

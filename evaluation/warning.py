@@ -18,10 +18,12 @@ from filter import BarrierFilter
 from models import Bundle
 from monitor.networks import Networks
 from pointgoal import seeds
-from pointgoal.loop import drive, groups
+from pointgoal.loop import SIDE_BY_SIDE, drive, groups
+from pointgoal.scene import STEP_SECONDS
 from pointgoal.seeds import Use
 from pointgoal.simulation import EPISODE_STEPS
 from pointgoal.vector import PointGoalVectorEnv
+from trainer.features import COASTING
 
 if TYPE_CHECKING:
     from evaluation.calibrate import CalibrateConfig
@@ -29,17 +31,13 @@ if TYPE_CHECKING:
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
-STEP_SECONDS = 0.02
 HORIZONS = (0.1, 0.25, 0.5, 1.0, 2.0)
 """Within which a violation begins [s]."""
-COASTING = 0.519
-"""Decay time of the robot's speed without thrust [s], which coasts this times its velocity."""
 CAUGHT = 0.95
 """Share of violations that every score's threshold is set to catch, to compare false alarms and lead."""
 AHEAD = 0.25
 """How long before a violation it has to be caught [s]: about what braking from top speed takes."""
 RESAMPLES = 200
-_SIDE_BY_SIDE = 200
 SCORES = {
     "λ": "λ, from the observation",
     "coasting": "clearance of coasting, hazards given",
@@ -90,7 +88,7 @@ def play(bundle: Bundle, episodes: int, seed: int, console: Console) -> Drives:
     layouts = seeds.rows(Use.WARNING_REPORT, seed, episodes)
     with progress_bar(console) as bar:
         job = bar.add_task("unfiltered episodes", total=episodes * EPISODE_STEPS)
-        for part in groups(episodes, _SIDE_BY_SIDE):
+        for part in groups(episodes, SIDE_BY_SIDE):
             env = PointGoalVectorEnv(bundle.manifest.level, part.stop - part.start)
             now: dict[str, FloatArray] = {}
 

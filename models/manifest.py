@@ -45,11 +45,9 @@ class Calibration(_Strict):
 
     Attributes:
         method: "closed loop": of gates in a fixed order, from the most open one on, each was tried on fresh
-            episodes of the loop that is deployed; the last one that passed was taken. "onset": by the order
-            statistic of the smallest λ ahead of violations of unfiltered episodes.
-        miss_rate: α: an episode is missed, in that the barrier had to open the gate before λ did (or, of
-            "onset", λ was not above the threshold all the time ahead of a violation), with at most this
-            probability,
+            episodes of the loop that is deployed; the last one that passed was taken.
+        miss_rate: α: an episode is missed, in that the barrier had to open the gate before λ did, with at
+            most this probability,
         confidence: with this confidence 1 − δ.
         episodes: that each gate was tried on.
         missed: of those, under the gate that was taken.
@@ -60,7 +58,7 @@ class Calibration(_Strict):
         multiplier: the SHA-256 of the multiplier.onnx that it is for.
     """
 
-    method: Literal["closed loop", "onset"]
+    method: Literal["closed loop"]
     miss_rate: Annotated[float, Field(gt=0.0, lt=1.0)]
     confidence: Annotated[float, Field(gt=0.0, lt=1.0)]
     episodes: Positive

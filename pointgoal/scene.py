@@ -11,6 +11,8 @@ TIMESTEP = 0.002
 """Physics step [s]."""
 PHYSICS_STEPS = 10
 """Physics steps in one control step."""
+STEP_SECONDS = TIMESTEP * PHYSICS_STEPS
+"""Duration of a control step [s]."""
 VASE_SIZE = 0.1
 """Half the side of a vase, a box [m]."""
 VASE_HEIGHT = VASE_SIZE - 4e-5

@@ -42,6 +42,8 @@ class Use(IntEnum):
     """`lagnet-calibrate`: the closed loops by which a gate is chosen."""
     WARNING_REPORT = 11
     """`lagnet-calibrate --report`: how well λ warns."""
+    NETWORK_SPEED = 12
+    """`benchmarks.networks`: the states that it runs on."""
 
 
 def rows(use: Use, seed: int, count: int) -> list[int]:

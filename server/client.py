@@ -22,6 +22,7 @@ from decision import (
     Memory,
     Mode,
     fall_back,
+    memory_of,
     memory_to_json,
 )
 from server.link import Link
@@ -168,9 +169,7 @@ class Client:
         return model
 
     def _one_robots(self, memory: Memory | np.void) -> Memory:
-        if getattr(memory, "dtype", None) != MEMORY or memory.size != 1:
-            raise ValueError("the memory is not that of one robot")
-        one = np.array(memory).reshape(1)
+        one = memory_of(1, memory).copy()
         # It may be all that the robot has to go by.
         plan = one["plan"][0, : one["left"][0]]
         if not ((plan >= self._low) & (plan <= self._high)).all():

@@ -16,10 +16,10 @@ from math import comb
 import numpy as np
 import numpy.typing as npt
 
+from pointgoal.scene import STEP_SECONDS
+
 LEAD = 0.6
 """Lead time the filter needs [s]: to turn, and to stop from top speed."""
-STEP = 0.02
-"""Duration of a control step [s]."""
 MISS = 0.05
 """α: largest share of violating episodes that the gate may open too late for."""
 DOUBT = 0.05
@@ -49,7 +49,7 @@ def scores(multiplier: npt.NDArray[np.floating], cost: npt.NDArray[np.floating])
     Returns:
         [n], in the episodes' order; −∞ where a violation begins before the lead time has passed.
     """
-    lead = round(LEAD / STEP)
+    lead = round(LEAD / STEP_SECONDS)
     found = []
     for episode in range(cost.shape[1]):
         violating = cost[:, episode] > 0

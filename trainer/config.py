@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -177,6 +178,12 @@ class Config:
     def per_decision(self, discount: float) -> float:
         """A discount for a decision from one for a control step."""
         return float(discount**self.action_repeat)
+
+    @property
+    def level(self) -> int | None:
+        """The level of a PointGoal task; None for another task."""
+        match = re.fullmatch(r"PointGoal([012])-v\d+", self.task)
+        return None if match is None else int(match[1])
 
     @property
     def epochs(self) -> int:

@@ -30,10 +30,11 @@ from trainer.algorithms import ALGORITHMS, prepare_environments
 from trainer.algorithms.base import Algorithm
 from trainer.calibration import Threshold, calibrate
 from trainer.closed_loop import Episodes, episodes
+from trainer.config import Config
 from trainer.errors import CheckpointError, ExportError, TrainerError
 from trainer.learner import Learner
 from trainer.networks import mlp
-from trainer.train import below, level_of, load_config, make_environments, why_not_exported
+from trainer.train import below, load_config, make_environments, why_not_exported
 from trainer.warning import WarningConfig, fit
 
 TOLERANCE = 1e-5
@@ -174,7 +175,7 @@ def export(config: ExportConfig, console: Console | None = None) -> Manifest:
         )
     _check_target(config)
     run = TrainedRun(config.run)
-    level = _level(run)
+    level = _level(run.config)
     fitted = _fit(run, level, config.warning_episodes, console or Console(quiet=True))
     played = play(run, config.episodes, config.threads)
     seen = played.observation[np.isfinite(played.observation).all(-1)]
@@ -292,10 +293,11 @@ def _check_target(config: ExportConfig) -> None:
         raise ExportError(f"{config.bundle}: there is a bundle already; --replace replaces it")
 
 
-def _level(run: TrainedRun) -> int:
-    if why := why_not_exported(run.config):
+def _level(config: Config) -> int:
+    if why := why_not_exported(config):
         raise ExportError(why)
-    return level_of(run.config.task)
+    assert config.level is not None
+    return config.level
 
 
 @dataclass(frozen=True)

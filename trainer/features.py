@@ -5,8 +5,6 @@ for onnxruntime, where a step costs its dispatch and a small matrix product cost
 linear is a product with a constant matrix, and reductions run over the last axis or are products.
 """
 
-import re
-
 import numpy as np
 import torch
 from torch import Tensor, nn
@@ -194,10 +192,9 @@ class Features(nn.Module):
 
 def surroundings(config: Config) -> Surroundings | None:
     """The surroundings of the task; None if it has no hazards, or config.nearness is 0."""
-    match = re.fullmatch(r"PointGoal([12])-v\d+", config.task)
-    if match is None or config.nearness == 0:
+    if not config.level or config.nearness == 0:
         return None
-    where = layout(int(match[1]))
+    where = layout(config.level)
     goal, hazards = where.slice("goal_lidar"), where.slice("hazards_lidar")
     start = where.slice("velocimeter").start
     return Surroundings(slice(goal.start, hazards.stop), slice(start, start + 2), config.nearness)
