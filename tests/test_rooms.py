@@ -22,7 +22,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "guide": {"decision", "system", "filter", "pointgoal.observation"},
     "trainer": {"command", "pointgoal", "models", "decision", "system", "filter", "guide"},
     "monitor": {"decision", "system", "filter", "guide", "models", "pointgoal.observation"},
-    "server": {"command", "decision", "monitor", "models", "guide", "pointgoal.observation"},
+    "server": {"command", "decision", "monitor", "models", "filter", "guide", "pointgoal.observation"},
     "evaluation": {
         *(
             "command",
