@@ -406,14 +406,15 @@ def lines() -> Iterator[Line]:
 def late_lines() -> Iterator[Line]:
     """Late and lost: delays that the filter is told of, then what it is not."""
     told = [world for world in WORLDS if world.endswith(("steps old", "steps late"))]
-    policies = (REWARD_ONLY, "random", "thrust", "attacker", SHIPPED)
+    policies = (REWARD_ONLY, "random", "thrust", "attacker")
     for world, policy, source in itertools.product(told, policies, SOURCES):
         yield Line(policy, world, source, "always", DEFAULT_STRENGTH)
-    for world, policy in itertools.product(told, (REWARD_ONLY, SHIPPED)):
-        yield Line(policy, world, "given", "none", "off")
+    for world in told:
+        yield Line(SHIPPED, world, "lidar", "always", DEFAULT_STRENGTH)
+        yield Line(SHIPPED, world, "given", "none", "off")
     not_told = [world for world in WORLDS if world.endswith(("not told", "lost", "shaken by 0.1", "ready"))]
-    for world, policy, source in itertools.product(not_told, (REWARD_ONLY, "attacker"), SOURCES):
-        yield Line(policy, world, source, "always", DEFAULT_STRENGTH)
+    for world, policy in itertools.product(not_told, (REWARD_ONLY, "attacker")):
+        yield Line(policy, world, "lidar", "always", DEFAULT_STRENGTH)
 
 
 @dataclass

@@ -32,6 +32,8 @@ HISTORY = np.dtype(
 - ``age``: for how many control steps it is the last one; 0: there is none.
 """
 
+_NO_HISTORY = bytes(HISTORY.itemsize)
+
 MEMORY = np.dtype(
     [
         ("plan", "f8", (PLAN_STEPS, 2)),
@@ -98,12 +100,12 @@ def remember_sent(memory: Memory, action: ArrayLike) -> None:
 
 def memory_to_json(memory: np.void) -> dict[str, Any]:
     """One robot's memory as plain JSON, to be handed back with the next observation."""
-    left = int(memory["left"])
+    left, history = int(memory["left"]), memory["history"].tobytes()
     return {
         "side": int(memory["side"]),
         "guided": int(memory["guided"]),
         "open": int(memory["open"]),
-        "history": base64.b64encode(memory["history"].tobytes()).decode("ascii"),
+        "history": "" if history == _NO_HISTORY else base64.b64encode(history).decode("ascii"),
         "plan": memory["plan"][:left].tolist() if memory["planned"] else None,
     }
 
@@ -115,14 +117,15 @@ def memory_from_json(value: Mapping[str, Any]) -> Memory:
         ValueError: if the value is not a memory that this version wrote; the message names the field.
     """
     memory = np.zeros(1, MEMORY)
-    if set(value) != {"side", "guided", "open", "plan", "history"}:
+    if set(value) | {"history"} != {"side", "guided", "open", "plan", "history"}:
         raise ValueError(f"memory has the fields {sorted(value)}, expected guided, history, open, plan, side")
     for name, least, most in (("side", -127, 127), ("guided", -1, 1), ("open", 0, MOST_OPEN)):
         number = value[name]
         if isinstance(number, bool) or not isinstance(number, int) or not least <= number <= most:
             raise ValueError(f"memory.{name} must be a whole number in {least}..{most}, got {number!r}")
         memory[name] = number
-    memory["history"] = _history(value["history"])
+    if value.get("history", "") != "":
+        memory["history"] = _history(value["history"])
     if value["plan"] is None:
         return memory
     plan = value["plan"]
@@ -143,8 +146,9 @@ def _history(value: object) -> np.void:
     if len(data) != HISTORY.itemsize:
         raise ValueError(f"memory.history must be the base64 of {HISTORY.itemsize} bytes")
     history: np.void = np.frombuffer(data, HISTORY)[0]
-    numbers = np.frombuffer(data, np.float32, HISTORY.itemsize // 4 - 2)
-    if not np.isfinite(numbers).all() or np.abs(history["sent"]).max() > 1.0 or history["age"] < 0:
+    sizes = np.abs(np.frombuffer(data, np.float32, 2 * (MOST_LATE + 1) + SENSED))
+    sound = sizes.max() < np.inf and sizes[: 2 * (MOST_LATE + 1)].max() <= 1.0 and history["age"] >= 0
+    if not sound:  # NaN is neither
         raise ValueError("memory.history has numbers that no robot is sent or sees")
     return history
 
