@@ -28,10 +28,11 @@ from decision import (
 )
 from filter import DOUBT, BarrierFilter, FilterConfig, FilterInputError, Robot, Scene
 from guide import DEFAULT_STRENGTH, Guide, Strength
+from inference import NetworkError, Networks
+from inference.networks import FloatArray, within
 from models import Bundle
-from monitor.errors import MonitorError, NetworkError
+from monitor.errors import MonitorError
 from monitor.gate import BoolArray, Gate, GateName
-from monitor.networks import FloatArray, Networks, within
 from pointgoal.observation import layout
 
 

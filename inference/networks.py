@@ -6,8 +6,8 @@ import numpy as np
 import onnxruntime
 from numpy.typing import NDArray
 
+from inference.errors import NetworkError
 from models import Bundle, BundleError
-from monitor.errors import NetworkError
 from system.compiled import entry
 
 FloatArray = NDArray[np.float64]

@@ -11,8 +11,8 @@ import onnxruntime
 import pytest
 from onnx import TensorProto, helper
 
+from inference import Networks
 from models import Bundle
-from monitor.networks import Networks
 
 SHIPPED = sorted((Path(__file__).parents[2] / "models").glob("*/manifest.json"))
 
@@ -44,7 +44,7 @@ def sessions(monkeypatch) -> list[object]:
             made.append(self)
             return super().run(*arguments)
 
-    monkeypatch.setattr("monitor.networks.onnxruntime.InferenceSession", Counted)
+    monkeypatch.setattr("inference.networks.onnxruntime.InferenceSession", Counted)
     return made
 
 
