@@ -20,7 +20,7 @@ import tyro
 from torch import nn
 
 from inference import Networks
-from inference.networks import session
+from inference.session import session
 from models import Bundle
 from monitor import Monitor
 from pointgoal import seeds

@@ -2,23 +2,32 @@
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Callable
+
 import numpy as np
+import onnx
 import onnxruntime
 from numpy.typing import NDArray
 
+from inference.cut import Answer, Cut, compare
 from inference.errors import NetworkError
-from models import Bundle, BundleError
+from inference.session import session
+from inference.trials import trials
+from models import Bundle, BundleError, features
 from system.compiled import entry
 
 FloatArray = NDArray[np.float64]
 _ROUNDING = 1e-6
+_LOGGER = logging.getLogger("lagnet.inference")
 
 
 class Networks:
     """Policy and multiplier network of one bundle.
 
-    One intra-op thread without spinning: for networks this small a pool costs more than it computes, and
-    spinning takes the core that the robot's other software needs. What both compute is computed once.
+    What both compute is computed once. Where the files say what their features are, compiled code computes
+    these; but if that, tried on hundreds of observations, does not come to what the graph itself gives, the
+    graph computes them, and a warning is logged.
 
     Args:
         bundle: a checked bundle.
@@ -30,10 +39,14 @@ class Networks:
     def __init__(self, bundle: Bundle) -> None:
         self._bundle = bundle
         self.observation_size = bundle.manifest.observation_size
+        self._answer: Callable[[FloatArray], Answer]
         try:
-            self._sessions = [session("joined", bundle.joined())]
+            joined = bundle.joined()
+            self._answer = _whole(session("joined", joined))
         except (BundleError, NetworkError):  # each by itself: it runs, or is named
-            self._sessions = [session("policy", bundle.policy), session("multiplier", bundle.multiplier)]
+            self._answer = _whole(session("policy", bundle.policy), session("multiplier", bundle.multiplier))
+            return
+        self._answer = self._cut(onnx.load_model_from_string(joined)) or self._answer
 
     def __reduce__(self) -> tuple[type[Networks], tuple[Bundle]]:
         return Networks, (self._bundle,)
@@ -47,21 +60,42 @@ class Networks:
         Returns:
             nominal action [N, 2] and risk score λ_ξ(s) [N] (paper eq. 14).
         """
-        feed = {"observation": observation.astype(np.float32)}
-        action, risk = [output for session in self._sessions for output in session.run(None, feed)]
+        action, risk = self._answer(observation)
         return action.astype(np.float64), risk.astype(np.float64)
 
+    def _cut(self, joined: onnx.ModelProto) -> Cut | None:
+        """The networks from their features on, if the files tell these and it gives what the graph gives."""
+        manifest = self._bundle.manifest
+        try:
+            numbers = features.read(joined)
+            if numbers is None:
+                files = map(onnx.load_model_from_string, (self._bundle.policy, self._bundle.multiplier))
+                if not all(map(features.told, files)):
+                    return None
+                raise BundleError("what the two files say of them is not understood, or not the same")
+            cut = Cut(joined, numbers)
+            largest = np.maximum(np.abs(manifest.action_low), np.abs(manifest.action_high))
+            tried = trials(numbers)
+            for seen in (tried[:1], tried[1:2], tried):
+                compare(cut(seen), self._answer(seen), largest)
+        except Exception as error:  # noqa: BLE001 - whatever it is, there is the whole graph
+            why = " ".join(str(error).split())
+            _LOGGER.warning(
+                "%s: its graph computes the features, which takes longer: %s", self._bundle.id, why
+            )
+            return None
+        return cut
 
-def session(name: str, graph: bytes) -> onnxruntime.InferenceSession:
-    """A graph, ready to run; NetworkError if onnxruntime refuses it."""
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = 1
-    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    options.log_severity_level = 3
-    try:
-        return onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"])
-    except Exception as error:
-        raise NetworkError(f"{name}.onnx: onnxruntime refuses it: {' '.join(str(error).split())}") from error
+
+def _whole(*sessions: onnxruntime.InferenceSession) -> Callable[[FloatArray], Answer]:
+    """Of all that the sessions compute, from the observation on."""
+
+    def answer(observation: FloatArray) -> Answer:
+        feed = {"observation": observation.astype(np.float32)}
+        action, risk = [output for session in sessions for output in session.run(None, feed)]
+        return action, risk
+
+    return answer
 
 
 @entry
