@@ -178,9 +178,10 @@ def _apart(number: Row, x: float, y: float, end_x: float, end_y: float) -> float
 
 @compiled
 def _map(number: Row, cos: Row, sin: Row, distance: Row, sight: float, exponent: Row) -> None:
-    """Write log(number 4 / gain) of every direction, the largest of all hazards'; `cos` and `sin` are used up.
+    """Write log(number 4 / gain) of every direction: the largest of all hazards'.
 
-    The hazards' loop is the inner one, so that their largest stays in a register: six times as fast.
+    ``cos``, ``sin`` and ``distance`` are used up. The hazards' loop is the inner one, so that their largest
+    stays in a register: six times as fast.
     """
     for b in range(LIDAR_BINS):
         cos[b], sin[b] = cos[b] * sight, sin[b] * sight
