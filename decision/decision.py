@@ -18,8 +18,7 @@ TextArray = NDArray[np.str_]
 
 @lru_cache(maxsize=64)
 def texts(text: str, n: int) -> TextArray:
-    """The same text n times, wide enough for any of `Mode`, `Origin`, `OpenedBy` and the sensors' names; not
-    to be written to."""
+    """The same text n times, not to be written to; wide enough for whatever stands in `Decisions`."""
     made = np.full(n, text, dtype="<U13")
     made.setflags(write=False)
     return made

@@ -144,7 +144,7 @@ def calibrate(config: CalibrateConfig, console: Console) -> tuple[Manifest, list
             "calibration": calibration,
         }
     )
-    written = write_bundle(bundle.path, bundle.policy, bundle.multiplier, manifest)
+    written = write_bundle(bundle.path, bundle.policy, bundle.multiplier, manifest, bundle.novelty)
     return written.manifest, [*tried, alone]
 
 

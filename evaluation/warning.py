@@ -15,8 +15,8 @@ from rich.table import Table
 
 from command import progress_bar
 from filter import BarrierFilter
+from inference import Networks
 from models import Bundle
-from monitor.networks import Networks
 from pointgoal import seeds
 from pointgoal.loop import SIDE_BY_SIDE, drive, groups
 from pointgoal.scene import STEP_SECONDS

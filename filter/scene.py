@@ -56,8 +56,7 @@ class Scene:
         obstacles: (N, M, COLUMNS), from where the next action takes effect; of each robot's, the first
             ``seen["count"]`` count.
         source: (N, M) each one's hazard, or, behind those, its lidar bin.
-        doubted: (N,) whether the hazards' lidar contradicts itself, or somebody says so of a sensor; their
-            barrier is NaN.
+        doubted: (N,) whether a sensor is not to be trusted; their barrier is NaN.
     """
 
     observation: FloatArray
@@ -72,7 +71,7 @@ class Scene:
         return len(self.seen)
 
     def doubt(self, which: BoolArray) -> None:
-        """Trust nothing of what some robots (N,) see: not how fast they are either, so they cannot brake."""
+        """Trust nothing of what some robots (N,) see, nor how fast they are: they cannot brake."""
         self.doubted = self.doubted | which
         self.seen["now"]["clearance"][which] = np.nan
         self.seen["sure"]["clearance"][which] = -FAR

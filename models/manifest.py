@@ -11,6 +11,7 @@ FORMAT_VERSION: Literal[1] = 1
 """Version of the bundle format that this code reads and writes."""
 POLICY_FILE = "policy.onnx"
 MULTIPLIER_FILE = "multiplier.onnx"
+NOVELTY_FILE = "novelty.npz"
 MANIFEST_FILE = "manifest.json"
 
 NAME = r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}"
@@ -70,6 +71,26 @@ class Calibration(_Strict):
     multiplier: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
 
+class NoveltySource(_Strict):
+    """Where novelty.npz comes from, and what its limits let pass.
+
+    Attributes:
+        episodes: that it was learnt from, in the closed loop, and
+        limit_episodes: others, by which the limits were found: they had no alarm.
+        hours: that these lasted.
+        alarms_per_hour: at most so many false alarms an hour, with 95 % confidence.
+        hazards: what the filter knew of them.
+        seed: of the episodes.
+    """
+
+    episodes: Positive
+    limit_episodes: Positive
+    hours: Annotated[float, Field(gt=0.0)]
+    alarms_per_hour: Annotated[float, Field(gt=0.0)]
+    hazards: Literal["given", "lidar"]
+    seed: Annotated[int, Field(ge=0)]
+
+
 class Manifest(_Strict):
     """What a bundle says about itself; written as manifest.json.
 
@@ -90,6 +111,7 @@ class Manifest(_Strict):
         hysteresis: an open gate stays open while λ is above this share of the threshold.
         dwell: for how many control steps after that it still stays open.
         calibration: how threshold, hysteresis and dwell were chosen; None: they were not.
+        novelty: where novelty.npz comes from; None: there is none.
         hazard_radius: radius of a hazard [m].
         robot: the robot's constants, name → number, as `system.Robot` names them; empty: the task's own.
         opset: version of the standard ONNX operators that both graphs use.
@@ -115,11 +137,13 @@ class Manifest(_Strict):
     hysteresis: Annotated[float, Field(gt=0.0, le=1.0)] = 1.0
     dwell: Annotated[int, Field(ge=0, le=1000)] = 0
     calibration: Calibration | None = None
+    novelty: NoveltySource | None = None
     hazard_radius: Annotated[float, Field(gt=0.0)]
     robot: dict[str, Annotated[int | float, Field(gt=0)]] = {}
     opset: Positive
     sha256: dict[
-        Literal["policy.onnx", "multiplier.onnx"], Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+        Literal["policy.onnx", "multiplier.onnx", "novelty.npz"],
+        Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")],
     ] = {}
     training: dict[str, Any] = {}
     figures: dict[str, float] = {}

@@ -1,8 +1,8 @@
 """What the sensors should show, by what they showed before and what the robot was sent since.
 
 The robot's exact model tells from one observation what velocimeter, gyro and magnetometer show in the next
-one, and where a thing has moved to that a lidar shows by itself. A sensor that is dead, frozen, negated, noisy
-or late shows something else as soon as the robot moves.
+one, and where a thing has moved to that a lidar shows by itself. A sensor that is dead, frozen, negated,
+noisy or late shows something else as soon as the robot moves.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def _lidar(before: Readings, now: Readings, at: State) -> tuple[float, float]:
     shown = 1.0 - math.hypot(px, py) / LIDAR_RANGE
     if shown <= 0.0:
         return off, past
-    place = int(math.floor(math.atan2(py, px) / BIN_WIDTH)) + LIDAR_BINS
+    place = math.floor(math.atan2(py, px) / BIN_WIDTH) + LIDAR_BINS
     miss, beside, found = 1e9, 0.0, False
     for i in range(place - 1, place + 2):
         bin = i % LIDAR_BINS
@@ -105,10 +105,10 @@ def _lidar(before: Readings, now: Readings, at: State) -> tuple[float, float]:
 
 @compiled
 def _same(before: Readings, now: Readings) -> bool:
+    same = True
     for i in range(len(before)):
-        if before[i] != np.float32(now[i]):
-            return False
-    return True
+        same &= before[i] == np.float32(now[i])
+    return same
 
 
 @compiled
@@ -144,11 +144,11 @@ def compare(robot: Robot, delay: int, now: FloatArray, past: Any, least: FloatAr
     vx, vy = np.float64(before[_VELOCIMETER]), np.float64(before[_VELOCIMETER + 1])
     start = State(0.0, 0.0, 0.0, vx, vy, np.float64(before[_GYRO + 2]))
     at = once_arrived(robot, start, sent[delay:], past.age)
-    vx, vy = in_own_frame(at.x + at.vx, at.y + at.vy, at)
+    ahead, aside = in_own_frame(at.x + at.vx, at.y + at.vy, at)
     mx, my = in_own_frame(at.x + before[_MAGNETOMETER], at.y + before[_MAGNETOMETER + 1], at)
-    ahead = _acceleration(robot, vx, at.yaw_rate, sent[delay, 0])
-    off[0] = max(abs(now[_ACCELEROMETER] - ahead), abs(now[_ACCELEROMETER + 2] - _GRAVITY))
-    off[1] = max(abs(now[_VELOCIMETER] - vx), abs(now[_VELOCIMETER + 1] - vy))
+    pushed = _acceleration(robot, ahead, at.yaw_rate, sent[delay, 0])
+    off[0] = max(abs(now[_ACCELEROMETER] - pushed), abs(now[_ACCELEROMETER + 2] - _GRAVITY))
+    off[1] = max(abs(now[_VELOCIMETER] - ahead), abs(now[_VELOCIMETER + 1] - aside))
     off[2] = abs(now[_GYRO + 2] - at.yaw_rate)
     off[3] = max(abs(now[_MAGNETOMETER] - mx), abs(now[_MAGNETOMETER + 1] - my))
     for sensor in range(4):
@@ -182,7 +182,8 @@ def _numbers(seen: FloatArray, numbers: FloatArray) -> None:
 
 def count_of_numbers(observation_size: int) -> int:
     """How many numbers `surprise` compares."""
-    return observation_size + 4 + 3 * ((observation_size - _LIDARS) // LIDAR_BINS)
+    lidars = (observation_size - int(_LIDARS)) // LIDAR_BINS
+    return observation_size + 4 + 3 * lidars
 
 
 def groups_of_numbers(count: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -268,8 +269,9 @@ def weigh(
     suspect: NDArray[np.int64],
     doubted: NDArray[np.bool_],
 ) -> bool:
-    """The largest of the distances ``off`` (N, 2, 7) in parts of their ``limits`` (2, 7); whether any matters.
+    """Find the largest of the distances ``off`` (N, 2, 7) in parts of their ``limits`` (2, 7).
 
+    Returns whether any is above 1, or a sensor is still not trusted.
     ``novelty`` (N,) receives it, ``suspect`` (N,) whose it is, and ``doubted`` (N,) whether a sensor that the
     filter steers by is not trusted, now or still.
     """

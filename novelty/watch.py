@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 from dataclasses import dataclass
+from functools import lru_cache
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -12,7 +14,6 @@ from numpy.typing import NDArray
 from decision import Memory
 from novelty.consistency import (
     GROUPS,
-    STEERED_BY,
     count_of_numbers,
     groups_of_numbers,
     measure,
@@ -119,7 +120,7 @@ class Watch:
         self._tables = _tables(normal)
 
     def look(self, observation: FloatArray, memory: Memory) -> Findings:
-        """What is to be said of N observations (N, O), finite, given what is remembered of the robots (N,)."""
+        """What is to be said of N observations (N, O), which are finite, given the robots' memory (N,)."""
         n = len(observation)
         off = np.empty((n, 2, 7))
         measure(self._robot, self._delay, observation, memory, self.normal.least, self._tables, off)
@@ -133,14 +134,21 @@ class Watch:
         remember(observation, findings.off, self.normal.limits, HOLD, memory)
 
 
+@lru_cache(maxsize=64)
+def nothing(n: int) -> Findings:
+    """What is to be said of N observations that nobody looks at."""
+    return Findings(np.full(n, np.nan), _nobody(n), np.zeros(n, np.bool_), False, np.empty((n, 2, 7)))
+
+
 def learn(observation: FloatArray) -> Normal:
     """What is normal, from observations (n, O) of a policy's own drives; the limits are still to be found."""
     numbers = np.empty((len(observation), count_of_numbers(observation.shape[1])))
     numbers_of(np.ascontiguousarray(observation, np.float64), numbers)
     covariance = np.cov(numbers.T)
     ridge = _RIDGE * np.maximum(np.diag(covariance), np.diag(covariance).mean())
-    precision = np.linalg.inv(covariance + np.diag(ridge))
-    return Normal(numbers.mean(axis=0), precision, np.zeros(3), np.full((2, 7), np.inf))
+    precision = np.asarray(np.linalg.inv(covariance + np.diag(ridge)), np.float64)
+    mean: FloatArray = numbers.mean(axis=0)
+    return Normal(mean, precision, np.zeros(3), np.full((2, 7), np.inf))
 
 
 def calibrate(normal: Normal, largest: FloatArray, least: FloatArray) -> Normal:
@@ -155,6 +163,7 @@ def calibrate(normal: Normal, largest: FloatArray, least: FloatArray) -> Normal:
     return Normal(normal.mean, normal.precision, 0.5 * least, np.maximum(limits, 1e-6))
 
 
+@lru_cache(maxsize=64)
 def _nobody(n: int) -> NDArray[np.str_]:
     return np.full(n, "", dtype="<U13")
 
@@ -163,7 +172,7 @@ def _tables(normal: Normal) -> tuple[FloatArray, FloatArray, Any, Any, FloatArra
     """What `consistency.surprise` takes."""
     order, bounds = groups_of_numbers(len(normal.mean))
     inverse = np.zeros_like(normal.precision)
-    for first, last in zip(bounds[:-1], bounds[1:], strict=True):
+    for first, last in pairwise(bounds.tolist()):
         block = order[first:last]
         inverse[first:last, first:last] = np.linalg.inv(normal.precision[np.ix_(block, block)])
     return normal.mean, normal.precision, order, bounds, inverse
