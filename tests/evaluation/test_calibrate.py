@@ -20,10 +20,11 @@ from scipy.stats import mannwhitneyu
 from evaluation import warning
 from evaluation.calibrate import CalibrateConfig, Tried, calibrate
 from evaluation.errors import CalibrateError
-from evaluation.sequence import last_to_pass, most_missed, p_value
+from evaluation.sequence import last_to_pass
 from evaluation.warning import Drives, coasting_clearance, false_alarms, judge, labels, lead, onsets
 from models import Bundle, BundleError, write_bundle
 from monitor import Monitor
+from trainer.binomial import most_missed, p_value
 
 QUIET = Console(quiet=True)
 
@@ -62,10 +63,10 @@ def fake(results: dict[float, int], monkeypatch) -> list:
             pass
 
         def __enter__(self):
-            def run(gate, number, done):
+            def run(gate, number, done, count=1000):
                 ran.append((gate, number))
                 missed = results[gate.threshold] if gate.floor else 0
-                return Tried(gate, missed, 3 if not gate.floor else 0, 0.2, 24.0)
+                return Tried(gate, missed, 3 if not gate.floor else 0, 0.2, 24.0, (0.75, 0.25, 0.5))
 
             return run
 
@@ -88,9 +89,11 @@ def test_the_last_gate_that_passes_is_written_into_the_bundle(
     found = manifest.calibration
     assert (found.missed, found.tried, found.episodes, found.violated_without_floor) == (4, 3, 1000, 3)
     assert [one.gate.threshold for one in tried] == [0.1, 0.2, 0.3, 0.2]
-    assert [gate.floor for gate, _ in ran] == [True, True, True, False]
-    # Fresh episodes for each: no two gates share any.
-    assert len({number for _, number in ran}) == 4
+    assert [gate.floor for gate, _ in ran] == [True, True, True, False, True]
+    assert ran[-1][0] == ran[1][0]
+    assert found.scores == (0.25, 0.5, 0.75)
+    # Fresh episodes for each: no two gates share any, and those to compare with are not the gate's own.
+    assert len({number for _, number in ran}) == 5
     after = Bundle.load(path)
     assert (after.policy, after.multiplier) == (before.policy, before.multiplier)
     gate = Monitor.load(path).gate

@@ -45,7 +45,7 @@ def test_what_is_no_gate_is_refused(settings, named) -> None:
 
 @pytest.mark.parametrize("threshold", [0.5, 0.0, 0.9])
 def test_a_threshold_beside_a_whole_gate_is_refused(tiny_bundle, threshold) -> None:
-    """It would be ignored, even where it is the gate's own; a gate's name takes it, a whole gate alone too."""
+    """It would be ignored, even where it is the gate's own; a gate's name takes it."""
     gate = Gate("risk", 0.5, dwell=3)
     with pytest.raises(MonitorError, match="threshold must be None beside a Gate"):
         Monitor.load(tiny_bundle, gate=gate, threshold=threshold)
