@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from rich.console import Console
-from scipy.stats import mannwhitneyu
+from scipy.stats import binom, mannwhitneyu
 
 from evaluation import warning
 from evaluation.calibrate import CalibrateConfig, Tried, calibrate
@@ -37,8 +37,7 @@ def test_the_promise_fails_no_more_often_than_it_says(rates) -> None:
     allowed = most_missed(episodes, miss_rate, confidence)
     chosen = [last_to_pass(rates, lambda rate: rng.binomial(episodes, rate) <= allowed) for _ in range(1000)]
     broken = sum(rate is not None and rate > miss_rate for rate in chosen)
-    # 100 are expected at most; five standard deviations more would be a defect.
-    assert broken <= 100 + 5 * np.sqrt(90)
+    assert broken <= binom.ppf(1 - 1e-4, 1000, 1.0 - confidence)
     if rates[0] > miss_rate:
         assert broken > 50
     else:
