@@ -15,6 +15,8 @@ from __future__ import annotations
 
 import hashlib
 import io
+import struct
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -29,14 +31,10 @@ from evaluation.errors import CalibrateError
 
 FloatArray = NDArray[np.float64]
 _UNREADABLE = (
-    OSError,
-    ValueError,
-    EOFError,
-    zipfile.BadZipFile,
-    zlib.error,
-    NotImplementedError,
-    RuntimeError,
+    *(OSError, ValueError, EOFError, KeyError, OverflowError, MemoryError, NotImplementedError, RuntimeError),
+    *(zipfile.BadZipFile, zlib.error, struct.error, tokenize.TokenError),
 )
+"""What numpy and zipfile raise on damaged files."""
 
 
 @dataclass(frozen=True)
@@ -73,11 +71,11 @@ def read_log(path: Path, observation_size: int, costs: bool = True) -> Log:
     """
     try:
         data = path.read_bytes()
-        with np.load(io.BytesIO(data), allow_pickle=False) as file:
-            if not isinstance(file, Mapping):
-                raise ValueError("it is a single array")
-            names = ("observation", "cost", "episode") if costs else ("observation", "episode")
-            arrays = {name: _numbers(path, name, file) for name in names}
+        file = np.load(io.BytesIO(data), allow_pickle=False)
+        if not isinstance(file, Mapping):
+            raise ValueError("a single array")
+        names = ("observation", "cost", "episode") if costs else ("observation", "episode")
+        arrays = {name: _numbers(path, name, file) for name in names}
     except CalibrateError:
         raise
     except _UNREADABLE as error:

@@ -111,7 +111,7 @@ WRONG_ARRAYS = {
     "texts": ({"cost": np.full(ROWS, "0.1")}, "cost must be numbers"),
     "objects": ({"cost": np.array([None] * ROWS)}, "cost must be an array of numbers"),
     "complex": ({"observation": np.zeros((ROWS, 60), complex)}, "observation must be numbers"),
-    "halves": ({"episode": np.arange(ROWS) // STEPS + 0.5}, "episode must be whole numbers, got 0.5 in row 0"),
+    "halves": ({"episode": np.arange(ROWS) // STEPS + 0.5}, "must be whole numbers, got 0.5 in row 0"),
     "comes again": ({"episode": np.arange(ROWS) // STEPS % 20}, "episode 0 begins again in row 1000"),
 }  # fmt: skip
 
@@ -201,7 +201,7 @@ def test_what_cannot_be_checked_is_refused(own_bundle: Path, tmp_path: Path) -> 
     manifest = calibrate_on_logs(asked(own_bundle, log))
     with pytest.raises(CalibrateError, match=r"calibration\.npz: is one that the gate was calibrated on"):
         check_logs(asked(own_bundle, new, log))
-    with pytest.raises(CalibrateError, match="3 episodes with a violation .* at least 6 are needed"):
+    with pytest.raises(CalibrateError, match=r"3 episodes with a violation .* at least 6 are needed"):
         check_logs(asked(own_bundle, record(tmp_path / "few.npz", 3, 50)))
     with pytest.raises(CalibrateError, match="--confidence"):
         check_logs(asked(own_bundle, new, confidence=1.0))
