@@ -32,7 +32,7 @@ from evaluation.errors import CalibrateError
 FloatArray = NDArray[np.float64]
 _UNREADABLE = (
     *(OSError, ValueError, EOFError, KeyError, OverflowError, MemoryError, NotImplementedError, RuntimeError),
-    *(zipfile.BadZipFile, zlib.error, struct.error, tokenize.TokenError),
+    *(zipfile.BadZipFile, zlib.error, struct.error, tokenize.TokenError, SyntaxError),
 )
 """What numpy and zipfile raise on damaged files."""
 
