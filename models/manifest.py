@@ -65,16 +65,16 @@ class Calibration(_Strict):
         confidence: with this confidence 1 − δ.
         episodes: that each gate was tried on; that the logs hold.
         missed: of those, under the gate that was taken.
-        multiplier: the SHA-256 of the multiplier.onnx that it is for.
-        scores: of a sample of its episodes, rising, for `lagnet-calibrate --check`: how silent λ was where it
-            had to speak, see `evaluation.exchange`; None: none were kept.
         violated_without_floor: closed loop: of as many episodes with the barrier's floor off, how many had a
             violation.
+        scores: of a sample of its episodes, rising, for `lagnet-calibrate --check`: how silent λ was where it
+            had to speak, see `evaluation.exchange`; None: none were kept.
+        violating: onset: episodes with a violation, n.
+        logs: onset: the SHA-256 of each log.
         hazards: closed loop: what the filter knew of them.
         tried: closed loop: how many gates.
         seed: closed loop: of the episodes.
-        violating: onset: episodes with a violation, n.
-        logs: onset: the SHA-256 of each log.
+        multiplier: the SHA-256 of the multiplier.onnx that it is for.
     """
 
     method: Literal["closed loop", "onset"]
@@ -82,14 +82,14 @@ class Calibration(_Strict):
     confidence: Annotated[float, Field(gt=0.0, lt=1.0)]
     episodes: Positive
     missed: Annotated[int, Field(ge=0)]
-    multiplier: Sha256
-    scores: Annotated[tuple[Share, ...], Field(min_length=1, max_length=MOST_SCORES)] | None = None
     violated_without_floor: Annotated[int, Field(ge=0)] | None = None
+    scores: Annotated[tuple[Share, ...], Field(min_length=1, max_length=MOST_SCORES)] | None = None
+    violating: Positive | None = None
+    logs: Annotated[tuple[Sha256, ...], Field(min_length=1)] | None = None
     hazards: Literal["given", "lidar"] | None = None
     tried: Positive | None = None
     seed: Annotated[int, Field(ge=0)] | None = None
-    violating: Positive | None = None
-    logs: Annotated[tuple[Sha256, ...], Field(min_length=1)] | None = None
+    multiplier: Sha256
 
     @model_validator(mode="after")
     def _has_what_its_form_has(self) -> Self:
