@@ -29,7 +29,15 @@ from evaluation.recorded import barrier_filter, calibrate_on_logs, check_gate, c
 from evaluation.sequence import last_to_pass
 from evaluation.tables import table_console
 from guide import DEFAULT_STRENGTH, Strength
-from models import MOST_SCORES, Bundle, BundleError, Calibration, Manifest, write_bundle
+from models import (
+    MOST_SCORES,
+    Bundle,
+    BundleError,
+    Calibration,
+    Manifest,
+    check_target,
+    write_bundle,
+)
 from monitor import Gate, Monitor, MonitorError, NetworkError
 from pointgoal.loop import SIDE_BY_SIDE
 from pointgoal.seeds import Use
@@ -117,6 +125,7 @@ def calibrate(config: CalibrateConfig, console: Console) -> tuple[Manifest, list
         BundleError, MonitorError: if the bundle cannot be used.
     """
     bundle = Bundle.load(config.bundle)
+    check_target(config.bundle)
     gates = _gates(config)
     allowed = _allowed(config)
     tried: list[Tried] = []
@@ -276,7 +285,7 @@ class _Listening:
         decisions = self._monitor.decide_batch(observation, hazards, memory)
         # By the lidar, whatever the filter is given: a robot's log has no more.
         now = silence(decisions.risk[None], self._filter.look(observation).low[None])
-        self.silences = np.maximum(self.silences, now)
+        self.silences = np.fmax(self.silences, now)  # where the network gave no number, the gate is open
         return decisions
 
 

@@ -15,7 +15,7 @@ from evaluation.errors import CalibrateError
 from evaluation.exchange import Exchangeability, fewest_episodes, silence
 from evaluation.logs import Log, read_log
 from filter import BarrierFilter, FilterConfig
-from models import MOST_SCORES, Bundle, Calibration, Manifest, write_bundle
+from models import MOST_SCORES, Bundle, Calibration, Manifest, check_target, write_bundle
 from monitor import Monitor
 from monitor.networks import Networks
 from pointgoal import seeds
@@ -62,6 +62,7 @@ def calibrate_on_logs(config: CalibrateConfig) -> Manifest:
     check_promise(config)
     check_gate(config)
     bundle = Bundle.load(config.bundle)
+    check_target(config.bundle)
     logs = _read(config.log, bundle, costs=True)
     risks = [part for log in logs for part in _risks(bundle, log)]
     if np.ptp(np.concatenate(risks)) == 0.0:

@@ -134,6 +134,14 @@ def test_what_can_promise_nothing_is_refused_and_the_bundle_is_as_it_was(
     assert (tiny_bundle / "manifest.json").read_bytes() == before
 
 
+def test_a_bundle_that_cannot_be_written_is_refused_before_anything_is_run(own_bundle, monkeypatch) -> None:
+    (own_bundle / "notes.txt").write_text("mine")
+    ran = fake({0.3: 0}, monkeypatch)
+    with pytest.raises(BundleError, match=r"holds notes\.txt"):
+        calibrate(CalibrateConfig(own_bundle, thresholds=(0.3,)), QUIET)
+    assert not ran
+
+
 def test_it_runs_as_it_is_typed(tiny_bundle: Path, tmp_path: Path) -> None:
     path = shutil.copytree(tiny_bundle, tmp_path / tiny_bundle.name)
     command = [sys.executable, "-m", "evaluation.calibrate", str(path), "--episodes", "3", "--processes", "1"]
