@@ -12,6 +12,11 @@ def test_rank_is_the_largest_the_binomial_law_allows(n):
     assert rank(n) == max(allowed, default=0)
 
 
+@pytest.mark.parametrize("n", [2000, 5000])
+def test_many_episodes_are_no_overflow(n):
+    assert rank(n, 0.5, 0.95) == max(k for k in range(1, n) if binom.cdf(k - 1, n, 0.5) <= 0.05)
+
+
 def test_the_published_sample_sizes():
     assert [rank(n) for n in (58, 59, 92, 93)] == [0, 1, 1, 2]
 
