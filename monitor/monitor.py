@@ -60,7 +60,7 @@ class Monitor:
         networks: its networks.
         action_filter: the filter.
         gate: when the filter is active: its name, and the bundle says the rest; or all of it.
-        threshold: λ above which the gate `risk` opens; None takes the bundle's.
+        threshold: λ above which the gate `risk` opens; None takes the bundle's, or that of a whole gate.
         guide: how much the filter's guide may do, to be told.
         watch: looks at what the sensors show; None: nobody does.
 
@@ -69,8 +69,8 @@ class Monitor:
         robot: the constants of the bundle's robot.
 
     Raises:
-        MonitorError: for an unknown gate, a threshold that is not finite and >= 0, or a bundle whose
-            observation layout is not the task's.
+        MonitorError: for an unknown gate, a threshold that is not finite and >= 0 or stands beside a whole
+            gate, or a bundle whose observation layout is not the task's.
     """
 
     def __init__(
@@ -89,9 +89,10 @@ class Monitor:
         self.robot = _robot(bundle)
         self.guide: Strength = guide
         self.faults = Faults()
+        if isinstance(gate, Gate) and threshold is not None:
+            raise MonitorError(f"threshold must be None beside a Gate, which has its own, got {threshold}")
         wanted = manifest.threshold if threshold is None else float(threshold)
-        own = Gate(gate, wanted, manifest.hysteresis, manifest.dwell) if isinstance(gate, str) else gate
-        self.gate: Gate = own
+        self.gate = Gate(gate, wanted, manifest.hysteresis, manifest.dwell) if isinstance(gate, str) else gate
         self._networks = networks
         self._filter = action_filter
         self._watch = watch
@@ -112,7 +113,7 @@ class Monitor:
         Args:
             path: the bundle's folder.
             gate: when the filter is active: its name, and the bundle says the rest; or all of it.
-            threshold: λ above which the gate `risk` opens; None takes the bundle's.
+            threshold: λ above which the gate `risk` opens; None takes the bundle's, or that of a whole gate.
             filter_config: the filter's settings; None takes the defaults. The hazards' radius and the robot's
                 constants are the bundle's where the settings leave them open.
             guide: how much the guide may do: off, from a refusal on, or ahead.
