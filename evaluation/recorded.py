@@ -15,9 +15,9 @@ from evaluation.errors import CalibrateError
 from evaluation.exchange import Exchangeability, fewest_episodes, silence
 from evaluation.logs import Log, read_log
 from filter import BarrierFilter, FilterConfig
+from inference import Networks
 from models import MOST_SCORES, Bundle, Calibration, Manifest, check_target, write_bundle
 from monitor import Monitor
-from monitor.networks import Networks
 from pointgoal import seeds
 from pointgoal.seeds import Use
 from trainer.calibration import LEAD, calibrate, scores
@@ -96,7 +96,7 @@ def calibrate_on_logs(config: CalibrateConfig) -> Manifest:
         "calibration": calibration,
     }
     manifest = bundle.manifest.model_copy(update=changes)
-    return write_bundle(bundle.path, bundle.policy, bundle.multiplier, manifest).manifest
+    return write_bundle(bundle.path, bundle.policy, bundle.multiplier, manifest, bundle.novelty).manifest
 
 
 def check_logs(config: CalibrateConfig) -> Checked:

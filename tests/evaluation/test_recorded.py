@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from inference import Networks
 
 from decision import MOST_OPEN
 from evaluation import calibrate as command
@@ -18,7 +19,6 @@ from evaluation.logs import read_log
 from evaluation.recorded import _of_the_loop, calibrate_on_logs, check_logs
 from models import Bundle, Calibration, write_bundle
 from monitor import Gate, Monitor
-from monitor.networks import Networks
 from pointgoal.loop import drive
 from pointgoal.vector import PointGoalVectorEnv
 
