@@ -33,11 +33,13 @@ _ACCELEROMETER, _VELOCIMETER, _GYRO, _MAGNETOMETER, _LIDARS = (
 _GRAVITY = 9.81
 _ALONE = 3e-4
 """How much the two readings beside a bin may differ from its own, together, for a thing alone in it."""
-_TOUCHED = 0.4
-"""Things nearer than this may move, or be met [m]."""
+_FAR = 0.2
+"""Weakest reading by which a thing is followed: 2.4 m."""
+_NEAR = (0.4, 0.0, 0.4)
+"""Goals and vases nearer than this may be met, or moved [m]; hazards stay where they are."""
 NEVER = 1e9
 """A distance beyond every limit."""
-FROZEN = (0.3, 0.01, 0.2, 0.005, 0.01, 0.01, 0.01)
+FROZEN = (0.3, 0.01, 0.2, 0.005, 0.001, 0.001, 0.001)
 """A sensor whose numbers are to the last bit what they were is frozen if they should have changed by this."""
 
 
@@ -63,44 +65,50 @@ def _strongest(readings: Readings) -> int:
 
 
 @compiled
-def _lidar(before: Readings, now: Readings, at: State) -> tuple[float, float]:
-    """By how much a lidar (16,) shows other things than it should [m], and how far the robot moved past them.
-
-    ``at`` is where the robot is now, from where it was.
-    """
-    b = _strongest(before)
-    moved = math.hypot(at.x, at.y)
-    was, most = np.float64(before[b]), np.float64(now[_strongest(now)])
-    off = 0.0
-    for i in range(LIDAR_BINS):
-        off = max(off, -LIDAR_RANGE * now[i], LIDAR_RANGE * (now[i] - 1.0))
-    near = LIDAR_RANGE * (1.0 - max(was, most))
-    past = moved if was > 0.0 else 0.0
-    if near < _TOUCHED:
-        return off, past
-    if was > 0.0 and was < 1.0:
-        # The nearest thing comes no nearer, and goes no further, than the robot moves; out of sight it is 0.
-        off = max(off, LIDAR_RANGE * abs(most - was) - moved if most > 0.0 else LIDAR_RANGE * was - moved)
+def _misplaced(before: Readings, now: Readings, b: int, at: State, near: float) -> float:
+    """How far the thing alone in bin b of a scan (16,) is from where the next one shows it [m]."""
     alone, x, y = _alone(before, b)
     if not alone:
-        return off, past
+        return 0.0
     px, py = in_own_frame(x, y, at)
-    shown = 1.0 - math.hypot(px, py) / LIDAR_RANGE
-    if shown <= 0.0:
-        return off, past
+    away = math.hypot(px, py)
+    shown = 1.0 - away / LIDAR_RANGE
+    if away < near or shown < _FAR:
+        return 0.0
     place = math.floor(math.atan2(py, px) / BIN_WIDTH) + LIDAR_BINS
-    miss, beside, found = 1e9, 0.0, False
+    miss, beside = NEVER, 0.0
     for i in range(place - 1, place + 2):
         bin = i % LIDAR_BINS
         beside = max(beside, np.float64(now[bin]))
         seen, qx, qy = _alone(now, bin)
         if seen:
-            found = True
             miss = min(miss, math.hypot(qx - px, qy - py))
-    if not found or beside > shown + _ALONE:
+    if beside > shown + _ALONE or not _alone(now, place % LIDAR_BINS)[0]:
         # Others are in the way of telling where it is; but it must show.
-        miss = max(LIDAR_RANGE * (shown - beside), 0.0)
-    return max(off, miss), past
+        return max(LIDAR_RANGE * (shown - beside), 0.0)
+    return miss
+
+
+@compiled
+def _lidar(before: Readings, now: Readings, at: State, near: float) -> tuple[float, float]:
+    """By how much a lidar (16,) shows other things than it should [m], and how far the robot moved past them.
+
+    ``at`` is where the robot is now, from where it was; things nearer than ``near`` [m] are not looked at.
+    """
+    moved = math.hypot(at.x, at.y)
+    was, most = np.float64(before[_strongest(before)]), np.float64(now[_strongest(now)])
+    off = 0.0
+    for i in range(LIDAR_BINS):
+        off = max(off, -LIDAR_RANGE * now[i], LIDAR_RANGE * (now[i] - 1.0))
+    past = moved if was > 0.0 else 0.0
+    if LIDAR_RANGE * (1.0 - max(was, most)) < near:
+        return off, past
+    if was > 0.0 and was < 1.0:
+        # The nearest thing comes no nearer, and goes no further, than the robot moves; out of sight it is 0.
+        off = max(off, LIDAR_RANGE * abs(most - was) - moved if most > 0.0 else LIDAR_RANGE * was - moved)
+    for b in range(LIDAR_BINS):
+        off = max(off, _misplaced(before, now, b, at, near))
+    return off, past
 
 
 @compiled
@@ -158,7 +166,7 @@ def compare(robot: Robot, delay: int, now: FloatArray, past: Any, least: FloatAr
     for lidar in range(lidars):
         i = _LIDARS + lidar * LIDAR_BINS
         old, new = before[i : i + LIDAR_BINS], now[i : i + LIDAR_BINS]
-        miss, moved = _lidar(old, new, at)
+        miss, moved = _lidar(old, new, at, _NEAR[lidar])
         if moved > FROZEN[4 + lidar] and _same(old, new):
             miss = NEVER
         off[4 + lidar] = max(off[4 + lidar], miss)
@@ -294,12 +302,13 @@ def remember(
     observation: FloatArray,
     off: FloatArray,
     limits: FloatArray,
-    hold: int,
+    hold: NDArray[np.int64],
     memory: NDArray[np.void],
 ) -> None:
     """Write down what was seen (N, O), and for how long a sensor is not trusted, in N robots' memory.
 
-    The first time for ``hold`` control steps after it was last caught, every time twice as long.
+    For the ``hold`` (2,) control steps of the first and the second time, after it was last caught; from the
+    third time on until the memory is a new one's.
     """
     for k in range(len(observation)):
         past = memory[k].history
@@ -312,6 +321,6 @@ def remember(
         if caught:
             if past.doubted == 0:
                 past.doubts = min(past.doubts + 1, 8)
-            past.doubted = hold * 2 ** (past.doubts - 1)
-        elif past.doubted > 0:
+            past.doubted = hold[min(past.doubts, len(hold)) - 1]
+        elif past.doubted > 0 and past.doubts <= len(hold):
             past.doubted -= 1

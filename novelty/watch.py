@@ -26,12 +26,13 @@ from system.point_robot import ROBOT, Robot
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
-FLOORS = np.array([[1.0, 0.04, 1.0, 0.01, 0.01, 0.01, 0.01], [0.0] * 7])
+FLOORS = np.array([[0.5, 0.02, 0.5, 0.002, 0.002, 0.002, 0.002], [0.0] * 7])
 """Least limits: of what a sensor may be off [m/s^2, m/s, rad/s, 1, m], and none of its surprise."""
-BEYOND = 1.25
+BEYOND = 1.5
 """A limit is this times the largest that was seen."""
-HOLD = 100
-"""For how many control steps a sensor that was caught is not trusted, the first time: 2 s."""
+HOLD = np.array([100, 500])
+"""For how many control steps a sensor that was caught is not trusted the first time, and the second: 2 s, 10 s.
+After the third it takes somebody to say that it is in order, by a new memory."""
 _RIDGE = 1e-3
 """Added to the variances, in parts of their mean: no sensor is exact."""
 _LEAST_VARIANCE = 1e-6
