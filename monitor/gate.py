@@ -11,13 +11,17 @@ from numpy.typing import NDArray
 
 from decision import MOST_OPEN, Memory, OpenedBy, texts
 from monitor.errors import MonitorError
+from system.compiled import entry
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.int16]
 
 GateName = Literal["risk", "always", "off"]
 """When the filter is active: where the risk score or the barrier asks for it, always, never."""
 GATES: tuple[GateName, ...] = get_args(GateName)
+_CAUSES = np.concatenate([texts(cause, 1) for cause in ("", OpenedBy.BARRIER, OpenedBy.DWELL, OpenedBy.RISK)])
+"""Each one overrides those before it."""
 
 
 @dataclass(frozen=True)
@@ -62,12 +66,10 @@ class Gate:
             low: (N,) whether the barrier is below its floor, see `filter.Scene.low`.
             memory: (N,) of `MEMORY`.
         """
-        n = len(risk)
         if self.name != "risk":
-            return texts(OpenedBy.ALWAYS if self.name == "always" else "", n)
-        opened = np.where(low & self.floor, texts(OpenedBy.BARRIER, n), texts("", n))
-        opened = np.where(memory["open"] > 0, texts(OpenedBy.DWELL, n), opened)
-        return np.where(risk <= self.threshold, opened, texts(OpenedBy.RISK, n))
+            return texts(OpenedBy.ALWAYS if self.name == "always" else "", len(risk))
+        left = np.ascontiguousarray(memory["open"])
+        return _CAUSES[_causes(risk, low, left, self.threshold, self.floor)]
 
     def remember(self, risk: FloatArray, low: BoolArray, changed: BoolArray, memory: Memory) -> None:
         """Write into N robots' memory how long their gates stay open; arguments as for `opened_by`.
@@ -75,8 +77,48 @@ class Gate:
         ``changed`` (N,): whether the filter sends another action than the policy's.
         """
         if self.name == "risk" and self.dwell:
-            low = low & self.floor
-            engaged = ~(risk <= self.threshold * self.hysteresis) | low | changed
-            before = memory["open"]
-            opened = (before > 0) | ~(risk <= self.threshold) | low
-            memory["open"] = np.where(engaged & opened, self.dwell, np.maximum(before - 1, 0))
+            left = np.array(memory["open"])
+            keep = self.threshold * self.hysteresis
+            _stay_open(risk, low, changed, left, self.threshold, keep, self.dwell, self.floor)
+            memory["open"] = left
+
+
+@entry
+def _causes(
+    risk: FloatArray, low: BoolArray, left: IntArray, threshold: float, floor: bool
+) -> NDArray[np.int64]:
+    """Places in `_CAUSES` of what opens N gates that have ``left`` (N,) steps to stay open."""
+    if not len(risk) == len(low) == len(left):
+        raise ValueError("risk, low and memory must be of the same robots")
+    causes = np.zeros(len(risk), np.int64)
+    for k in range(len(risk)):
+        if not risk[k] <= threshold:
+            causes[k] = 3
+        elif left[k] > 0:
+            causes[k] = 2
+        elif low[k] and floor:
+            causes[k] = 1
+    return causes
+
+
+@entry
+def _stay_open(
+    risk: FloatArray,
+    low: BoolArray,
+    changed: BoolArray,
+    left: IntArray,
+    threshold: float,
+    keep: float,
+    dwell: int,
+    floor: bool,
+) -> None:
+    """Write into ``left`` (N,) how many more steps N gates stay open, see `Gate.remember`."""
+    if not len(risk) == len(low) == len(changed) == len(left):
+        raise ValueError("risk, low, changed and memory must be of the same robots")
+    for k in range(len(risk)):
+        below = low[k] and floor
+        opened = left[k] > 0 or not risk[k] <= threshold or below
+        if opened and (not risk[k] <= keep or below or changed[k]):
+            left[k] = dwell
+        else:
+            left[k] = max(left[k] - 1, 0)
