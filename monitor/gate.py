@@ -68,8 +68,7 @@ class Gate:
         """
         if self.name != "risk":
             return texts(OpenedBy.ALWAYS if self.name == "always" else "", len(risk))
-        left = np.ascontiguousarray(memory["open"])
-        return _CAUSES[_causes(risk, low, left, self.threshold, self.floor)]
+        return _CAUSES[_causes(risk, low & self.floor, np.ascontiguousarray(memory["open"]), self.threshold)]
 
     def remember(self, risk: FloatArray, low: BoolArray, changed: BoolArray, memory: Memory) -> None:
         """Write into N robots' memory how long their gates stay open; arguments as for `opened_by`.
@@ -77,48 +76,36 @@ class Gate:
         ``changed`` (N,): whether the filter sends another action than the policy's.
         """
         if self.name == "risk" and self.dwell:
-            left = np.array(memory["open"])
-            keep = self.threshold * self.hysteresis
-            _stay_open(risk, low, changed, left, self.threshold, keep, self.dwell, self.floor)
+            left, keeps = np.array(memory["open"]), self.threshold * self.hysteresis
+            _stay(risk, low & self.floor, changed, left, self.threshold, keeps, self.dwell)
             memory["open"] = left
 
 
 @entry
-def _causes(
-    risk: FloatArray, low: BoolArray, left: IntArray, threshold: float, floor: bool
-) -> NDArray[np.int64]:
-    """Places in `_CAUSES` of what opens N gates that have ``left`` (N,) steps to stay open."""
+def _causes(risk: FloatArray, low: BoolArray, left: IntArray, opens: float) -> NDArray[np.int64]:
+    """Places in `_CAUSES` of what opens N gates with ``left`` (N,) steps to stay open."""
     if not len(risk) == len(low) == len(left):
         raise ValueError("risk, low and memory must be of the same robots")
     causes = np.zeros(len(risk), np.int64)
     for k in range(len(risk)):
-        if not risk[k] <= threshold:
-            causes[k] = 3
-        elif left[k] > 0:
-            causes[k] = 2
-        elif low[k] and floor:
-            causes[k] = 1
+        causes[k] = 3 if not risk[k] <= opens else 2 if left[k] > 0 else 1 if low[k] else 0
     return causes
 
 
 @entry
-def _stay_open(
+def _stay(
     risk: FloatArray,
     low: BoolArray,
     changed: BoolArray,
     left: IntArray,
-    threshold: float,
-    keep: float,
+    opens: float,
+    keeps: float,
     dwell: int,
-    floor: bool,
 ) -> None:
     """Write into ``left`` (N,) how many more steps N gates stay open, see `Gate.remember`."""
     if not len(risk) == len(low) == len(changed) == len(left):
         raise ValueError("risk, low, changed and memory must be of the same robots")
     for k in range(len(risk)):
-        below = low[k] and floor
-        opened = left[k] > 0 or not risk[k] <= threshold or below
-        if opened and (not risk[k] <= keep or below or changed[k]):
-            left[k] = dwell
-        else:
-            left[k] = max(left[k] - 1, 0)
+        opened = left[k] > 0 or not risk[k] <= opens or low[k]
+        engaged = not risk[k] <= keeps or low[k] or changed[k]
+        left[k] = dwell if opened and engaged else max(left[k] - 1, 0)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Protocol, cast
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from decision import (
     MEMORY,
@@ -33,6 +33,7 @@ from inference.networks import FloatArray, within
 from models import Bundle
 from monitor.errors import MonitorError
 from monitor.gate import BoolArray, Gate, GateName
+from novelty import Findings, Normal, Watch, nothing
 from pointgoal.observation import layout
 
 _NOMINAL = Mode.NOMINAL.value
@@ -42,7 +43,9 @@ _NOMINAL = Mode.NOMINAL.value
 class ActionFilter(Protocol):
     """What the monitor needs of a filter; `filter.BarrierFilter` is one."""
 
-    def look(self, observation: ArrayLike, hazards: ArrayLike | None = None) -> Scene:
+    def look(
+        self, observation: ArrayLike, hazards: ArrayLike | None = None, memory: Memory | None = None
+    ) -> Scene:
         """What N robots see."""
 
     def decide(self, scene: Scene, nominal: FloatArray, memory: Memory, active: BoolArray) -> Decisions:
@@ -60,16 +63,17 @@ class Monitor:
         networks: its networks.
         action_filter: the filter.
         gate: when the filter is active: its name, and the bundle says the rest; or all of it.
-        threshold: λ above which the gate `risk` opens; None takes the bundle's.
+        threshold: λ above which the gate `risk` opens; None takes the bundle's, or that of a whole gate.
         guide: how much the filter's guide may do, to be told.
+        watch: looks at what the sensors show; None: nobody does.
 
     Attributes:
         faults: what went wrong so far.
         robot: the constants of the bundle's robot.
 
     Raises:
-        MonitorError: for an unknown gate, a threshold that is not finite and >= 0, or a bundle whose
-            observation layout is not the task's.
+        MonitorError: for an unknown gate, a threshold that is not finite and >= 0 or stands beside a whole
+            gate, or a bundle whose observation layout is not the task's.
     """
 
     def __init__(
@@ -80,6 +84,7 @@ class Monitor:
         gate: GateName | Gate = "risk",
         threshold: float | None = None,
         guide: Strength = "off",
+        watch: Watch | None = None,
     ) -> None:
         _check_layout(bundle)
         manifest = bundle.manifest
@@ -87,11 +92,13 @@ class Monitor:
         self.robot = _robot(bundle)
         self.guide: Strength = guide
         self.faults = Faults()
+        if isinstance(gate, Gate) and threshold is not None:
+            raise MonitorError(f"threshold must be None beside a Gate, which has its own, got {threshold}")
         wanted = manifest.threshold if threshold is None else float(threshold)
-        own = Gate(gate, wanted, manifest.hysteresis, manifest.dwell) if isinstance(gate, str) else gate
-        self.gate: Gate = own
+        self.gate = Gate(gate, wanted, manifest.hysteresis, manifest.dwell) if isinstance(gate, str) else gate
         self._networks = networks
         self._filter = action_filter
+        self._watch = watch
         self._low = np.array(manifest.action_low, np.float64)
         self._high = np.array(manifest.action_high, np.float64)
         self._safe = np.clip(np.array(SAFE_ACTION, np.float64), self._low, self._high)
@@ -109,7 +116,7 @@ class Monitor:
         Args:
             path: the bundle's folder.
             gate: when the filter is active: its name, and the bundle says the rest; or all of it.
-            threshold: λ above which the gate `risk` opens; None takes the bundle's.
+            threshold: λ above which the gate `risk` opens; None takes the bundle's, or that of a whole gate.
             filter_config: the filter's settings; None takes the defaults. The hazards' radius and the robot's
                 constants are the bundle's where the settings leave them open.
             guide: how much the guide may do: off, from a refusal on, or ahead.
@@ -123,9 +130,10 @@ class Monitor:
             config = _filter_config(bundle, filter_config or FilterConfig())
             action_filter = BarrierFilter(config, Guide(config, guide))
             networks = Networks(bundle)
+            watch = _watch(bundle, config)
         except (NetworkError, ValueError) as error:
             raise MonitorError(f"{bundle.path}: {error}") from error
-        monitor = Monitor(bundle, networks, action_filter, gate, threshold, guide)
+        monitor = Monitor(bundle, networks, action_filter, gate, threshold, guide, watch)
         monitor._warm_up()
         return monitor
 
@@ -200,17 +208,17 @@ class Monitor:
         size = self._networks.observation_size
         if observation.shape[1:] != (size,):
             raise FilterInputError("observation", f"must have {size} numbers, got {observation.shape[1:]}")
-        scene = self._filter.look(observation, hazards)
+        scene = self._filter.look(observation, hazards, memory)
+        found = self._watch.look(observation, memory) if self._watch is not None else nothing(len(scene))
+        if found.any and self.gate.name != "off":
+            scene.doubt(found.doubted)
         nominal, risk = self._networks.run(observation)
         if nominal.shape != (len(observation), 2) or risk.shape != nominal.shape[:1]:
             raise NetworkError(f"the networks gave shapes {nominal.shape} and {risk.shape}")
         sound = np.empty(len(risk), np.bool_)
         all_sound = within(nominal, self._low, self._high, risk, sound) and lost is None
-        low = scene.low
-        opened_by = self.gate.opened_by(risk, low, memory)
-        if scene.doubted.any() and self.gate.name != "off":
-            opened_by = np.where(scene.doubted, texts(OpenedBy.FAULT, len(scene)), opened_by)
-            self.faults.note("lidar", DOUBT)
+        engaging = scene.low | (found.novelty > 1.0) if found.any else scene.low
+        opened_by = self._opened_by(scene, found, risk, engaging, memory)
         asked = nominal
         if not all_sound:
             sound &= lost is None
@@ -223,12 +231,36 @@ class Monitor:
         decided = self._filter.decide(scene, asked, memory, active)
         if decided.action is not asked or decided.mode.shape != active.shape:
             decided.check(asked, active, self._low, self._high)
+        if found.any and self.gate.name != "off":
+            decided = _say_why(decided, found)
         if not all_sound:
             decided = self._planned(
                 decided, [lost or self._wrong(*row) for row in zip(nominal, risk, sound, strict=True)]
             )
-        self.gate.remember(risk, low, decided.mode != _NOMINAL, decided.memory)
-        return decided.told(nominal, risk, self.gate.threshold, opened_by)
+        self.gate.remember(risk, engaging, decided.mode != _NOMINAL, decided.memory)
+        if self._watch is not None:
+            self._watch.remember(observation, found, decided.memory)
+        return decided.told(nominal, risk, self.gate.threshold, opened_by, found.novelty, found.suspect)
+
+    def _opened_by(
+        self, scene: Scene, found: Findings, risk: FloatArray, engaging: BoolArray, memory: Memory
+    ) -> NDArray[np.str_]:
+        """What opens the gate for N robots: its own causes, and those of doubt, which are noted."""
+        opened_by = self.gate.opened_by(risk, engaging, memory)
+        if found.any:
+            for sensor in np.unique(found.suspect[found.suspect != ""]).tolist():
+                self.faults.note(f"novelty: {sensor}", f"the {sensor} shows what it should not")
+        if self.gate.name == "off":
+            return opened_by
+        if found.any:
+            novel = found.doubted | (found.novelty > 1.0)
+            opened_by = np.where(novel, texts(OpenedBy.NOVELTY, len(scene)), opened_by)
+        if scene.doubted.any():
+            by_scan = scene.doubted & ~found.doubted
+            opened_by = np.where(by_scan, texts(OpenedBy.FAULT, len(scene)), opened_by)
+            if by_scan.any():
+                self.faults.note("lidar", DOUBT)
+        return opened_by
 
     def _wrong(self, nominal: FloatArray, risk: float, sound: np.bool_) -> str | None:
         """What is wrong with what the networks gave for a robot, noted; None if nothing is."""
@@ -279,6 +311,23 @@ class Monitor:
             scene = self._filter.look(at_rest, np.array([[[distance, 0.03]]]))
             self._filter.decide(scene, asked, np.zeros(1, MEMORY), np.ones(1, np.bool_))
             self.decide(at_rest[0], [[distance, 0.03]])
+
+
+def _say_why(decided: Decisions, found: Findings) -> Decisions:
+    """Names the sensor in the reasons of robots that stop because of it."""
+    reason = list(decided.reason)
+    for k in found.doubted.nonzero()[0]:
+        who = f"the {found.suspect[k]} shows" if found.suspect[k] else "a sensor showed"
+        reason[k] = (reason[k] or "").replace(DOUBT, f"{who} what it should not")
+    return replace(decided, reason=reason)
+
+
+def _watch(bundle: Bundle, config: FilterConfig) -> Watch | None:
+    """Who looks at the sensors; None if the bundle does not say what is normal."""
+    if bundle.novelty is None:
+        return None
+    normal = Normal.from_bytes(bundle.novelty, bundle.manifest.observation_size)
+    return Watch(normal, config.robot or _robot(bundle), config.delay_steps)
 
 
 def _robot(bundle: Bundle) -> Robot:

@@ -20,6 +20,7 @@ import tyro
 import uvicorn
 
 from command import command, settings
+from filter import FilterConfig
 from models import BundleError
 from monitor import DEFAULT_STRENGTH, GateName, Monitor, MonitorError, Strength
 from server.app import MAX_BODY, Lifecycle, create_app
@@ -58,6 +59,16 @@ class ServeConfig:
     """Risk score above which the gate `risk` activates the filter; by default the bundle's."""
     guide: Strength = DEFAULT_STRENGTH
     """How much the guide may do: nothing, lead on from a refused action on, or lead ahead."""
+    margin: float = FilterConfig.margin
+    """What the filter keeps from a hazard's edge for what its model leaves out [m]."""
+    position_error: float = 0.0
+    """Bound on the error of a hazard's measured distance [m]."""
+    bearing_error: float = 0.0
+    """Bound on the error of its bearing [rad]."""
+    travel_error: float = 0.0
+    """Bound on how far the robot strays from the filter's model, as a share of its way."""
+    delay_steps: int = 0
+    """How old observations are and how late actions take effect, together, in control steps."""
     api_key_file: Path | None = None
     """File that holds the key; otherwise the environment variable LAGNET_API_KEY."""
     max_body: int = MAX_BODY
@@ -72,8 +83,18 @@ class ServeConfig:
     drain_seconds: float = 0.5
     """How long /readyz says 503 before the service stops accepting connections [s]."""
 
+    def filter_config(self) -> FilterConfig:
+        """The filter's settings, or ServeError for one that is out of its range."""
+        names = ("margin", "position_error", "bearing_error", "travel_error", "delay_steps")
+        try:
+            return FilterConfig(**{name: getattr(self, name) for name in names})
+        except ValueError as error:
+            name, _, rest = str(error).partition(" ")
+            raise ServeError(f"--{name.replace('_', '-')} {rest}") from error
+
     def check(self) -> None:
         """Raises ServeError for what no service can be started with."""
+        self.filter_config()
         if not 0 <= self.port <= 65535:
             raise ServeError(f"--port must be 0 to 65535, got {self.port}")
         if self.max_body < 1 or self.max_connections < 1:
@@ -207,7 +228,9 @@ def serve(config: ServeConfig) -> None:
     allow_files(config.max_connections)
     listener = listen(config.host, config.port, api_key)
     with listener:
-        monitor = Monitor.load(config.bundle, config.gate, config.threshold, guide=config.guide)
+        monitor = Monitor.load(
+            config.bundle, config.gate, config.threshold, config.filter_config(), config.guide
+        )
         lifecycle = Lifecycle()
         app = create_app(monitor, lifecycle, api_key, config.max_body)
         host, port = listener.getsockname()[:2]
