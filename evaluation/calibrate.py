@@ -80,6 +80,9 @@ class CalibrateConfig:
     """Seed of the episodes' layouts."""
     processes: int = 0
     """How many run side by side; 0: one a CPU."""
+    novelty: bool = False
+    """Finds what is normal for the policy on its robot, by --episodes, half as many to learn from: above
+    the limits that go with it the gate opens whatever λ says, or the robot stops."""
     log: Annotated[tuple[Path, ...], tyro.conf.UseAppendAction] = ()
     """An .npz with the arrays observation (T, O), cost (T,) and episode (T,); once for each log."""
     check: bool = False
@@ -319,6 +322,8 @@ def main() -> None:
             _report(config, config.report, console)
         elif config.check:
             _check(config, console)
+        elif config.novelty:
+            _find_normal(config, console)
         else:
             _choose(config, console)
 
@@ -352,6 +357,18 @@ def _report(config: CalibrateConfig, folder: Path, console: Console) -> None:
     if why := why_not_folder(folder):
         raise CalibrateError(f"--report {folder}: {why}")
     table_console().print(report(config, console))
+
+
+def _find_normal(config: CalibrateConfig, console: Console) -> None:
+    from evaluation.novelty import find_normal
+
+    source = find_normal(config, console).novelty
+    assert source is not None
+    console.print(
+        f"{config.bundle}: what is normal is learnt from {source.episodes} episodes; no alarm in "
+        f"{source.limit_episodes} others, {source.hours:.1f} h: at most {source.alarms_per_hour:.2g} false "
+        "alarms an hour, confidence 95%"
+    )
 
 
 def _check(config: CalibrateConfig, console: Console) -> None:

@@ -96,7 +96,7 @@ def calibrate_on_logs(config: CalibrateConfig) -> Manifest:
         "calibration": calibration,
     }
     manifest = bundle.manifest.model_copy(update=changes)
-    return write_bundle(bundle.path, bundle.policy, bundle.multiplier, manifest).manifest
+    return write_bundle(bundle.path, bundle.policy, bundle.multiplier, manifest, bundle.novelty).manifest
 
 
 def check_logs(config: CalibrateConfig) -> Checked:

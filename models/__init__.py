@@ -2,7 +2,7 @@
 
 from models.bundle import Bundle, check_target, write_bundle
 from models.errors import BundleError
-from models.manifest import MOST_SCORES, Calibration, Manifest, ObservationBlock
+from models.manifest import MOST_SCORES, Calibration, Manifest, NoveltySource, ObservationBlock
 
 __all__ = [
     "MOST_SCORES",
@@ -10,6 +10,7 @@ __all__ = [
     "BundleError",
     "Calibration",
     "Manifest",
+    "NoveltySource",
     "ObservationBlock",
     "check_target",
     "write_bundle",

@@ -105,7 +105,7 @@ class Monitor:
 
     @staticmethod
     def load(
-        path: str | Path,
+        path: str | Path | Bundle,
         gate: GateName | Gate = "risk",
         threshold: float | None = None,
         filter_config: FilterConfig | None = None,
@@ -114,7 +114,7 @@ class Monitor:
         """Loads a bundle and runs a few decisions, so that the first real one is not the slow one.
 
         Args:
-            path: the bundle's folder.
+            path: the bundle's folder, or a bundle that is loaded.
             gate: when the filter is active: its name, and the bundle says the rest; or all of it.
             threshold: λ above which the gate `risk` opens; None takes the bundle's, or that of a whole gate.
             filter_config: the filter's settings; None takes the defaults. The hazards' radius and the robot's
@@ -125,7 +125,7 @@ class Monitor:
             BundleError: if the bundle must not be used.
             MonitorError: as the constructor, if the settings contradict the bundle, or it cannot decide.
         """
-        bundle = Bundle.load(path)
+        bundle = path if isinstance(path, Bundle) else Bundle.load(path)
         try:
             config = _filter_config(bundle, filter_config or FilterConfig())
             action_filter = BarrierFilter(config, Guide(config, guide))
@@ -133,9 +133,9 @@ class Monitor:
             watch = _watch(bundle, config)
         except (NetworkError, ValueError) as error:
             raise MonitorError(f"{bundle.path}: {error}") from error
-        monitor = Monitor(bundle, networks, action_filter, gate, threshold, guide, watch)
-        monitor._warm_up()
-        return monitor
+        # What a robot at rest nowhere in particular sees is novel: nobody watches that.
+        Monitor(bundle, networks, action_filter, gate, threshold, guide)._warm_up()
+        return Monitor(bundle, networks, action_filter, gate, threshold, guide, watch)
 
     def decide(
         self, observation: ArrayLike, hazards: ArrayLike | None = None, memory: Memory | np.void | None = None
@@ -327,7 +327,10 @@ def _watch(bundle: Bundle, config: FilterConfig) -> Watch | None:
     if bundle.novelty is None:
         return None
     normal = Normal.from_bytes(bundle.novelty, bundle.manifest.observation_size)
-    return Watch(normal, config.robot or _robot(bundle), config.delay_steps)
+    watch = Watch(normal, config.robot or _robot(bundle), config.delay_steps)
+    nobody, memory = np.zeros((1, bundle.manifest.observation_size)), np.zeros(1, MEMORY)
+    watch.remember(nobody, watch.look(nobody, memory), memory)
+    return watch
 
 
 def _robot(bundle: Bundle) -> Robot:

@@ -34,6 +34,7 @@ HOLD = 100
 """For how many control steps a sensor that was caught is not trusted, the first time: 2 s."""
 _RIDGE = 1e-3
 """Added to the variances, in parts of their mean: no sensor is exact."""
+_LEAST_VARIANCE = 1e-6
 _NAMES = np.array(GROUPS, dtype="<U13")
 
 
@@ -145,7 +146,7 @@ def learn(observation: FloatArray) -> Normal:
     numbers = np.empty((len(observation), count_of_numbers(observation.shape[1])))
     numbers_of(np.ascontiguousarray(observation, np.float64), numbers)
     covariance = np.cov(numbers.T)
-    ridge = _RIDGE * np.maximum(np.diag(covariance), np.diag(covariance).mean())
+    ridge = _RIDGE * np.maximum(np.diag(covariance), np.diag(covariance).mean()) + _LEAST_VARIANCE
     precision = np.asarray(np.linalg.inv(covariance + np.diag(ridge)), np.float64)
     mean: FloatArray = numbers.mean(axis=0)
     return Normal(mean, precision, np.zeros(3), np.full((2, 7), np.inf))
