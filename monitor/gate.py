@@ -94,18 +94,12 @@ def _causes(risk: FloatArray, low: BoolArray, left: IntArray, opens: float) -> N
 
 @entry
 def _stay(
-    risk: FloatArray,
-    low: BoolArray,
-    changed: BoolArray,
-    left: IntArray,
-    opens: float,
-    keeps: float,
-    dwell: int,
+    risk: FloatArray, low: BoolArray, changed: BoolArray, left: IntArray, opens: float, keeps: float, n: int
 ) -> None:
-    """Write into ``left`` (N,) how many more steps N gates stay open, see `Gate.remember`."""
+    """Write into ``left`` (N,) how many more steps gates stay open, n at most, see `Gate.remember`."""
     if not len(risk) == len(low) == len(changed) == len(left):
         raise ValueError("risk, low, changed and memory must be of the same robots")
     for k in range(len(risk)):
         opened = left[k] > 0 or not risk[k] <= opens or low[k]
         engaged = not risk[k] <= keeps or low[k] or changed[k]
-        left[k] = dwell if opened and engaged else max(left[k] - 1, 0)
+        left[k] = n if opened and engaged else max(left[k] - 1, 0)
