@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from inference import Networks
 
 from decision import MOST_OPEN
 from evaluation import calibrate as command
@@ -17,6 +16,7 @@ from evaluation.calibrate import CalibrateConfig, check_flags
 from evaluation.errors import CalibrateError
 from evaluation.logs import read_log
 from evaluation.recorded import _of_the_loop, calibrate_on_logs, check_logs
+from inference import Networks
 from models import Bundle, Calibration, write_bundle
 from monitor import Gate, Monitor
 from pointgoal.loop import drive
