@@ -68,7 +68,8 @@ class Gate:
         """
         if self.name != "risk":
             return texts(OpenedBy.ALWAYS if self.name == "always" else "", len(risk))
-        return _CAUSES[_causes(risk, low & self.floor, np.ascontiguousarray(memory["open"]), self.threshold)]
+        low = low if self.floor else low & False
+        return _CAUSES[_causes(risk, low, np.ascontiguousarray(memory["open"]), self.threshold)]
 
     def remember(self, risk: FloatArray, low: BoolArray, changed: BoolArray, memory: Memory) -> None:
         """Write into N robots' memory how long their gates stay open; arguments as for `opened_by`.
@@ -76,8 +77,8 @@ class Gate:
         ``changed`` (N,): whether the filter sends another action than the policy's.
         """
         if self.name == "risk" and self.dwell:
-            left, keeps = np.array(memory["open"]), self.threshold * self.hysteresis
-            _stay(risk, low & self.floor, changed, left, self.threshold, keeps, self.dwell)
+            left, low = np.array(memory["open"]), low if self.floor else low & False
+            _stay(risk, low, changed, left, self.threshold, self.threshold * self.hysteresis, self.dwell)
             memory["open"] = left
 
 

@@ -150,11 +150,11 @@ class Monitor:
 
         A bad input or any fault inside gives mode "fallback" with the reason.
         """
-        past, lost = np.zeros(1, MEMORY), None
+        lost = None
         try:
             past = memory_of(1, memory)
         except ValueError as error:
-            lost = self._bad(error)
+            past, lost = np.zeros(1, MEMORY), self._bad(error)
         try:
             row = np.array(observation, dtype=np.float64)[None]
             given = None if hazards is None else hazards_of_one(hazards)
@@ -255,7 +255,7 @@ class Monitor:
         if found.any:
             novel = found.doubted | (found.novelty > 1.0)
             opened_by = np.where(novel, texts(OpenedBy.NOVELTY, len(scene)), opened_by)
-        if scene.doubted.any():
+        if np.count_nonzero(scene.doubted):
             by_scan = scene.doubted & ~found.doubted
             opened_by = np.where(by_scan, texts(OpenedBy.FAULT, len(scene)), opened_by)
             if by_scan.any():
