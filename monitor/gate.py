@@ -20,6 +20,7 @@ IntArray = NDArray[np.int16]
 GateName = Literal["risk", "always", "off"]
 """When the filter is active: where the risk score or the barrier asks for it, always, never."""
 GATES: tuple[GateName, ...] = get_args(GateName)
+_ALWAYS = OpenedBy.ALWAYS.value
 _CAUSES = np.concatenate([texts(cause, 1) for cause in ("", OpenedBy.BARRIER, OpenedBy.DWELL, OpenedBy.RISK)])
 """Each one overrides those before it."""
 
@@ -67,7 +68,7 @@ class Gate:
             memory: (N,) of `MEMORY`.
         """
         if self.name != "risk":
-            return texts(OpenedBy.ALWAYS if self.name == "always" else "", len(risk))
+            return texts(_ALWAYS if self.name == "always" else "", len(risk))
         low = low if self.floor else low & False
         return _CAUSES[_causes(risk, low, np.ascontiguousarray(memory["open"]), self.threshold)]
 
