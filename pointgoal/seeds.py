@@ -45,12 +45,12 @@ class Use(IntEnum):
     """`lagnet-calibrate --report`: how well λ warns."""
     NETWORK_SPEED = 12
     """`benchmarks.networks`: the states that it runs on."""
+    EXCHANGE = 13
+    """The rest alone: how `lagnet-calibrate --check` orders equal scores."""
     NOVELTY = 14
     """`lagnet-calibrate --novelty`: what a policy's own drives look like."""
     SENSORS = 15
     """`benchmarks.sensors`; the rest: which sensor fails when, and how."""
-    EXCHANGE = 13
-    """The rest alone: how `lagnet-calibrate --check` orders equal scores."""
 
 
 def rows(use: Use, seed: int, count: int) -> list[int]:
