@@ -11,13 +11,18 @@ from numpy.typing import NDArray
 
 from decision import MOST_OPEN, Memory, OpenedBy, texts
 from monitor.errors import MonitorError
+from system.compiled import entry
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.int16]
 
 GateName = Literal["risk", "always", "off"]
 """When the filter is active: where the risk score or the barrier asks for it, always, never."""
 GATES: tuple[GateName, ...] = get_args(GateName)
+_ALWAYS = OpenedBy.ALWAYS.value
+_CAUSES = np.concatenate([texts(cause, 1) for cause in ("", OpenedBy.BARRIER, OpenedBy.DWELL, OpenedBy.RISK)])
+"""Each one overrides those before it."""
 
 
 @dataclass(frozen=True)
@@ -62,12 +67,10 @@ class Gate:
             low: (N,) whether the barrier is below its floor, see `filter.Scene.low`.
             memory: (N,) of `MEMORY`.
         """
-        n = len(risk)
         if self.name != "risk":
-            return texts(OpenedBy.ALWAYS if self.name == "always" else "", n)
-        opened = np.where(low & self.floor, texts(OpenedBy.BARRIER, n), texts("", n))
-        opened = np.where(memory["open"] > 0, texts(OpenedBy.DWELL, n), opened)
-        return np.where(risk <= self.threshold, opened, texts(OpenedBy.RISK, n))
+            return texts(_ALWAYS if self.name == "always" else "", len(risk))
+        low = low if self.floor else low & False
+        return _CAUSES[_causes(risk, low, np.ascontiguousarray(memory["open"]), self.threshold)]
 
     def remember(self, risk: FloatArray, low: BoolArray, changed: BoolArray, memory: Memory) -> None:
         """Write into N robots' memory how long their gates stay open; arguments as for `opened_by`.
@@ -75,8 +78,30 @@ class Gate:
         ``changed`` (N,): whether the filter sends another action than the policy's.
         """
         if self.name == "risk" and self.dwell:
-            low = low & self.floor
-            engaged = ~(risk <= self.threshold * self.hysteresis) | low | changed
-            before = memory["open"]
-            opened = (before > 0) | ~(risk <= self.threshold) | low
-            memory["open"] = np.where(engaged & opened, self.dwell, np.maximum(before - 1, 0))
+            left, low = np.array(memory["open"]), low if self.floor else low & False
+            _stay(risk, low, changed, left, self.threshold, self.threshold * self.hysteresis, self.dwell)
+            memory["open"] = left
+
+
+@entry
+def _causes(risk: FloatArray, low: BoolArray, left: IntArray, opens: float) -> NDArray[np.int64]:
+    """Places in `_CAUSES` of what opens N gates with ``left`` (N,) steps to stay open."""
+    if not len(risk) == len(low) == len(left):
+        raise ValueError("risk, low and memory must be of the same robots")
+    causes = np.zeros(len(risk), np.int64)
+    for k in range(len(risk)):
+        causes[k] = 3 if not risk[k] <= opens else 2 if left[k] > 0 else 1 if low[k] else 0
+    return causes
+
+
+@entry
+def _stay(
+    risk: FloatArray, low: BoolArray, changed: BoolArray, left: IntArray, opens: float, keeps: float, n: int
+) -> None:
+    """Write into ``left`` (N,) how many more steps gates stay open, n at most, see `Gate.remember`."""
+    if not len(risk) == len(low) == len(changed) == len(left):
+        raise ValueError("risk, low, changed and memory must be of the same robots")
+    for k in range(len(risk)):
+        opened = left[k] > 0 or not risk[k] <= opens or low[k]
+        engaged = not risk[k] <= keeps or low[k] or changed[k]
+        left[k] = n if opened and engaged else max(left[k] - 1, 0)

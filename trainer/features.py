@@ -2,7 +2,8 @@
 
 In torch, once: training computes it in single precision, and the exported graphs are traced from it. Written
 for onnxruntime, where a step costs its dispatch and a small matrix product costs next to nothing: what is
-linear is a product with a constant matrix, and reductions run over the last axis or are products.
+linear is a product with a constant matrix, and reductions run over the last axis or are products. At run time
+`inference.features` computes the same in compiled code.
 """
 
 import numpy as np

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import pickle
+import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -229,10 +230,15 @@ def test_pickled_they_are_the_same(name: str, runs) -> None:
 
 
 def test_threads_do_not_get_each_others_answers() -> None:
-    networks, observation = CUT["pointgoal1"], seen(400)
+    switching = sys.getswitchinterval()
+    networks, observation = CUT["pointgoal1"], np.tile(seen(400), (6, 1))
     expected = [networks.run(row[None]) for row in observation]
-    with ThreadPoolExecutor(8) as pool:
-        answers = list(pool.map(lambda row: networks.run(row[None]), observation))
+    sys.setswitchinterval(1e-6)
+    try:
+        with ThreadPoolExecutor(8) as pool:
+            answers = list(pool.map(lambda row: networks.run(row[None]), observation))
+    finally:
+        sys.setswitchinterval(switching)
     for one, other in zip(answers, expected, strict=True):
         np.testing.assert_array_equal(one[0], other[0])
         np.testing.assert_array_equal(one[1], other[1])

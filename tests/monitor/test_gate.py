@@ -63,6 +63,30 @@ def opened(gate: Gate, risks: list[float], low: list[bool], changed: list[bool])
     return causes
 
 
+def test_robots_are_told_apart_wherever_their_memory_lies() -> None:
+    gate = Gate("risk", 0.5, dwell=3)
+    risk, low = np.array([0.6, 0.1, 0.1, 0.1]), np.array([False, True, False, False])
+    memory = np.zeros(8, MEMORY)
+    every_second = memory[::-2]
+    every_second["open"] = [0, 0, 2, 0]
+    assert gate.opened_by(risk, low, every_second).tolist() == ["risk", "barrier", "dwell", ""]
+    gate.remember(risk, low, np.zeros(4, np.bool_), every_second)
+    assert memory["open"].tolist() == [0, 0, 0, 1, 0, 3, 0, 3]
+
+
+@pytest.mark.parametrize("short", ["risk", "low", "changed", "memory"])
+def test_robots_that_are_not_the_same_are_refused(short: str) -> None:
+    told = {"risk": np.zeros(3), "low": np.zeros(3, np.bool_), "changed": np.zeros(3, np.bool_)}
+    told |= {"memory": np.zeros(3, MEMORY)}
+    told[short] = told[short][:2]
+    gate = Gate("risk", 0.5, dwell=3)
+    with pytest.raises(ValueError, match="the same robots"):
+        gate.remember(**told)
+    if short != "changed":
+        with pytest.raises(ValueError, match="the same robots"):
+            gate.opened_by(told["risk"], told["low"], told["memory"])
+
+
 NO = [False] * 8
 
 

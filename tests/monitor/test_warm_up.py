@@ -13,16 +13,16 @@ from decision import MEMORY
 from filter import kernel, solvers
 from guide import guide
 from inference import features, networks
-from monitor import Monitor
+from monitor import Monitor, gate
 from pointgoal.lidar import encode
 
 entries = {
     name: entry
-    for room in (kernel, solvers, guide, features, networks)
+    for room in (kernel, solvers, guide, features, networks, gate)
     for name, entry in vars(room).items()
     if hasattr(entry, "signatures") and entry.__module__ == room.__name__
 }
-monitor = Monitor.load(sys.argv[1], "always", guide=sys.argv[2])
+monitor = Monitor.load(sys.argv[1], sys.argv[3], guide=sys.argv[2])
 before = {name: len(entry.signatures) for name, entry in entries.items()}
 
 goal = encode(np.array([[[1.5, 0.0]]]))[0]
@@ -47,9 +47,9 @@ assert monitor.faults.counts.total() == 0, monitor.faults.counts
 """
 
 
-def late(bundle: Path, guide: str) -> str:
+def late(bundle: Path, guide: str, gate: str) -> str:
     result = subprocess.run(
-        [sys.executable, "-c", SCRIPT, str(bundle), guide],
+        [sys.executable, "-c", SCRIPT, str(bundle), guide, gate],
         capture_output=True,
         text=True,
         timeout=120,
@@ -59,8 +59,8 @@ def late(bundle: Path, guide: str) -> str:
 
 
 def test_one_robot_and_many_run_what_was_compiled_at_load(tiny_bundle: Path) -> None:
-    assert late(tiny_bundle, "refusal") == ""
+    assert late(tiny_bundle, "refusal", "always") == ""
 
 
-def test_nor_are_the_features_compiled_late() -> None:
-    assert late(Path(__file__).parents[2] / "models" / "pointgoal1", "refusal") == ""
+def test_nor_are_the_features_or_the_gate_compiled_late() -> None:
+    assert late(Path(__file__).parents[2] / "models" / "pointgoal1", "refusal", "risk") == ""
