@@ -1,6 +1,6 @@
 """The networks, as pure functions of flat parameter vectors.
 
-All of them are perceptrons with two hidden layers of 64 tanh units. A network's parameters are one vector,
+All of them are perceptrons with two hidden layers of tanh units, 64 but for an exported λ. A network's parameters are one vector,
 so that an optimiser, a trust region and a checkpoint each handle one tensor.
 """
 
@@ -18,15 +18,16 @@ HIDDEN = 64
 
 @dataclass(frozen=True)
 class Shape:
-    """Layer sizes of a perceptron: inputs → 64 → 64 → outputs."""
+    """Layer sizes of a perceptron: inputs → hidden → hidden → outputs."""
 
     inputs: int
     outputs: int
+    hidden: int = HIDDEN
 
     @property
     def layers(self) -> list[tuple[int, int]]:
         """(inputs, outputs) of each layer."""
-        return list(pairwise((self.inputs, HIDDEN, HIDDEN, self.outputs)))
+        return list(pairwise((self.inputs, self.hidden, self.hidden, self.outputs)))
 
     @property
     def splits(self) -> list[int]:
@@ -78,9 +79,9 @@ def _layers(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The hidden layers' outputs [B, 64] and the last one's [B, o]."""
     w1, b1, w2, b2, w3, b3 = torch.split(theta, shape.splits)
-    first = squash(torch.addmm(b1, x, w1.view(-1, HIDDEN)))
-    second = squash(torch.addmm(b2, first, w2.view(HIDDEN, HIDDEN)))
-    return first, second, torch.addmm(b3, second, w3.view(HIDDEN, -1))
+    first = squash(torch.addmm(b1, x, w1.view(-1, shape.hidden)))
+    second = squash(torch.addmm(b2, first, w2.view(shape.hidden, -1)))
+    return first, second, torch.addmm(b3, second, w3.view(shape.hidden, -1))
 
 
 def fast_mlp(theta: Tensor, x: Tensor, shape: Shape) -> Tensor:
@@ -117,7 +118,7 @@ class _FastMlp(torch.autograd.Function):
             torch.mm(inputs.t(), error, out=gradient.view(inputs.shape[1], -1))
             torch.mv(error.t(), ones, out=bias)
             if weight is not None:
-                error = torch.ops.aten.tanh_backward(error @ weight.view(HIDDEN, -1).t(), inputs)
+                error = torch.ops.aten.tanh_backward(error @ weight.view(shape.hidden, -1).t(), inputs)
         return result, None, None
 
 

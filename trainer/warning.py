@@ -64,14 +64,16 @@ class WarningConfig:
         minibatches: steps of Adam.
         minibatch: states in each.
         learning_rate: at first; it falls to 0 as a cosine.
+        hidden: units of each of λ's two hidden layers.
     """
 
     episodes: int = 300
-    discount: float = 0.96
-    floor: float = 0.15
+    discount: float = 0.97
+    floor: float = 0.3
     minibatches: int = 20_000
     minibatch: int = 2000
     learning_rate: float = 1e-3
+    hidden: int = 128
 
 
 @dataclass(frozen=True)
@@ -273,7 +275,7 @@ def _regress(
     rng: np.random.Generator,
     progress: Callable[[float], None],
 ) -> tuple[FittedMultiplier, float]:
-    shape = Shape(inputs.shape[1], 1)
+    shape = Shape(inputs.shape[1], 1, config.hidden)
     parameters = initial(shape, rng, 1.0).requires_grad_()
     optimiser = torch.optim.Adam([parameters], config.learning_rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, config.minibatches)
