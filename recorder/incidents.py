@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import deque
+from collections.abc import Callable
 from datetime import UTC, datetime
 
 from recorder.channels import Entries, Scribe
@@ -35,7 +37,7 @@ class Ring:
         """Keeps an exchange, and lets go of what is too old or too much."""
         self._kept.append((now, exchange))
         self._size += exchange.size
-        while self._size > self._most or now - self._kept[0][0] > RING_SECONDS:
+        while self._kept and (self._size > self._most or now - self._kept[0][0] > RING_SECONDS):
             self._size -= self._kept.popleft()[1].size
 
     def exchanges(self, now: float) -> list[Exchange]:
@@ -53,18 +55,27 @@ class Incidents:
         about: what decided.
         scribe: writes exchanges down.
         file_bytes: how large a file may become; half of it is for what came before.
+        clock: the time [s].
 
     Attributes:
         count: how many there were.
         last: the name of the last one's file.
     """
 
-    def __init__(self, folder: Folder, about: About, scribe: Scribe, file_bytes: int) -> None:
+    def __init__(
+        self,
+        folder: Folder,
+        about: About,
+        scribe: Scribe,
+        file_bytes: int,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
         self._folder, self._about, self._scribe = folder, about, scribe
         self._file_bytes = file_bytes
+        self._clock = clock
         self._ring = Ring(file_bytes // 2)
         self._tape: Tape | None = None
-        self._began = self._until = -AFTER_SECONDS
+        self._began = self._until = -math.inf
         self.count = 0
         self.last: str | None = None
 
@@ -74,7 +85,7 @@ class Incidents:
         Raises:
             OSError: if it cannot be written. So do the other methods.
         """
-        now = time.monotonic()
+        now = self._clock()
         self._ring.add(exchange, now)
         if self._tape is not None:
             if now > min(self._until, self._began + MOST_SECONDS) or self._is_full(entries):
@@ -89,7 +100,7 @@ class Incidents:
             why: what.
             at: when [ns since 1970].
         """
-        now = time.monotonic()
+        now = self._clock()
         same, self._until = now <= self._until, now + AFTER_SECONDS
         if same:
             return
@@ -111,7 +122,7 @@ class Incidents:
         """Writes what has waited for long enough, and ends the file of an incident that is over."""
         if self._tape is None:
             return
-        if time.monotonic() > min(self._until, self._began + MOST_SECONDS):
+        if self._clock() > min(self._until, self._began + MOST_SECONDS):
             self.close()
         else:
             self._tape.flush_if_due()

@@ -77,7 +77,7 @@ def draw(path: Path, timeline: Timeline, robot: int, title: str) -> None:
 def _line(axes: Axes, seconds: FloatArray, values: list[float], **style: Any) -> None:
     """A line that breaks where nothing was asked for a while."""
     breaks = np.flatnonzero(np.diff(seconds) > _PAUSE) + 1
-    dots = {"marker": ".", "ms": 3} if len(seconds) - len(breaks) < 3 else {}
+    dots: dict[str, Any] = {"marker": ".", "ms": 3} if len(seconds) - len(breaks) < 3 else {}
     axes.plot(
         np.insert(seconds, breaks, np.nan), np.insert(np.array(values), breaks, np.nan), **dots, **style
     )

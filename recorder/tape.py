@@ -179,7 +179,9 @@ class Recording:
         """
         size = sum(len(data) + 64 for _, data in entries)
         if self._tape is not None and self._tape.size + size > self._file_bytes:
-            self.close()
+            self._tape.flush()  # what is compressed is less
+            if self._tape.size + size > self._file_bytes:
+                self.close()
         if self._tape is None:
             self._tape = Tape(self._folder.new(max(self._file_bytes, size)), self._about)
         self._tape.add(exchange, entries)
