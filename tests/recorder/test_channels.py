@@ -13,19 +13,15 @@ from recorder.exchange import Exchange
 SIMPLE = {"number": (int, float), "integer": (int,), "string": (str,), "boolean": (bool,)}
 
 
-def check(schema: dict[str, Any], nested: bool = False) -> None:
+def check(schema: dict[str, Any]) -> None:
     """Foxglove's parser throws at whatever else (mcap-support, parseJsonSchema)."""
     assert schema["type"] == "object"
     for field in schema["properties"].values():
         assert "oneOf" not in field
-        kind = field["type"]
-        if kind == "array":
-            kind = field["items"]["type"]
-            field = field["items"]
-            assert kind != "array"
-        assert kind in (*SIMPLE, "object")
-        if kind == "object":
-            check(field)
+        each = field["items"] if field["type"] == "array" else field
+        assert each["type"] in (*SIMPLE, "object")
+        if each["type"] == "object":
+            check(each)
 
 
 def conforms(value: Any, schema: dict[str, Any]) -> bool:

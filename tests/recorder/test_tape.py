@@ -115,8 +115,7 @@ def test_wherever_a_file_breaks_off_what_was_flushed_before_is_read(
         torn.write_bytes(whole[:length])
         try:
             reader, recorded = read(torn)
-        except RecordingError as error:
-            assert "no recording" in str(error)
+        except RecordingError:
             assert not counts
             continue
         assert not reader.ended

@@ -6,11 +6,11 @@ import json
 import re
 import shutil
 import struct
-import subprocess
 import sys
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -24,15 +24,34 @@ from recorder.exchange import Exchange
 from recorder.reading import Reader
 from recorder.tape import Tape
 from server.app import create_app
+from server.replay import main
 from server.schema import ModelReply
 
 STEPS = 60
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 
-def replay(*words: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "server.replay", *map(str, words)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+class Result(NamedTuple):
+    returncode: int
+    stdout: str
+    stderr: str
+
+
+@pytest.fixture
+def replay(monkeypatch, capsys) -> Callable[..., Result]:
+    """The command, in this process; `test_record.py` runs it as one of its own."""
+
+    def run(*words: object) -> Result:
+        monkeypatch.setattr(sys, "argv", ["lagnet-replay", *map(str, words)])
+        capsys.readouterr()
+        try:
+            main()
+            status = 0
+        except SystemExit as end:
+            status = int(end.code or 0)
+        return Result(status, *capsys.readouterr())
+
+    return run
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +99,7 @@ def rows(output: str) -> list[list[str]]:
     return [line.split() for line in output.splitlines() if re.match(r" *-?\d+\.\d{3} +\d+ ", line)]
 
 
-def test_the_same_bundle_decides_the_same_bit_for_bit(own: Path, tiny_bundle: Path) -> None:
+def test_the_same_bundle_decides_the_same_bit_for_bit(replay, own: Path, tiny_bundle: Path) -> None:
     result = replay(own, "--bundle", tiny_bundle, "--all")
     assert (result.returncode, result.stderr) == (0, "")
     count = 4 * STEPS + 1
@@ -93,7 +112,7 @@ def test_the_same_bundle_decides_the_same_bit_for_bit(own: Path, tiny_bundle: Pa
     assert own.with_suffix(".png").read_bytes().startswith(SIGNATURE)
 
 
-def test_the_timeline_has_the_changes_and_what_followed_them(own: Path) -> None:
+def test_the_timeline_has_the_changes_and_what_followed_them(replay, own: Path) -> None:
     result = replay(own)
     assert result.returncode == 0
     shown = rows(result.stdout)
@@ -101,14 +120,14 @@ def test_the_timeline_has_the_changes_and_what_followed_them(own: Path) -> None:
     assert len(shown) < 2 * STEPS
     for robot in "1234":
         kinds = [line[3:6] for line in shown if line[1] == robot]
-        assert all(one != two for one, two in zip(kinds, kinds[1:], strict=False))
+        assert all(one != two for one, two in pairwise(kinds))
     assert "too fast to stay clear" in " ".join(result.stdout.split())
     assert "least harm" in result.stdout
     assert "robot 2: " in result.stdout  # whom the picture shows
     assert "equal" not in result.stdout
 
 
-def test_one_robot_alone(own: Path, tiny_bundle: Path, tmp_path: Path) -> None:
+def test_one_robot_alone(replay, own: Path, tiny_bundle: Path, tmp_path: Path) -> None:
     picture = tmp_path / "one.png"
     result = replay(own, "--robot", 4, "--bundle", tiny_bundle, "--out", picture)
     assert f"{STEPS} of {STEPS} decisions equal bit for bit" in result.stdout
@@ -120,7 +139,9 @@ def test_one_robot_alone(own: Path, tiny_bundle: Path, tmp_path: Path) -> None:
     assert "no decision about robot 9" in result.stderr
 
 
-def test_an_incident_is_told_from_its_cause_on(recorded: Path, tiny_bundle: Path, tmp_path: Path) -> None:
+def test_an_incident_is_told_from_its_cause_on(
+    replay, recorded: Path, tiny_bundle: Path, tmp_path: Path
+) -> None:
     [incident] = recorded.parent.glob("incident-*.mcap")
     own = shutil.copy(incident, tmp_path)
     result = replay(own, "--bundle", tiny_bundle)
@@ -134,7 +155,7 @@ def test_an_incident_is_told_from_its_cause_on(recorded: Path, tiny_bundle: Path
 
 
 def test_another_bundle_decides_otherwise_and_it_is_said_where(
-    own: Path, make_bundle_of, tmp_path: Path
+    replay, own: Path, make_bundle_of, tmp_path: Path
 ) -> None:
     other = make_bundle_of(tmp_path / "other", multiplier_tail=["Neg", "Abs", "Sqrt"])
     result = replay(own, "--bundle", other)
@@ -167,7 +188,7 @@ def write_again(
 
 @pytest.mark.parametrize("field", ["action", "risk"])
 def test_the_last_bit_of_a_number_is_a_difference(
-    recorded: Path, tiny_bundle: Path, tmp_path: Path, field: str
+    replay, recorded: Path, tiny_bundle: Path, tmp_path: Path, field: str
 ) -> None:
     """The same recording but for one bit of one decision."""
 
@@ -192,7 +213,7 @@ def test_the_last_bit_of_a_number_is_a_difference(
 
 
 def test_a_file_that_breaks_off_is_replayed_up_to_there(
-    recorded: Path, tiny_bundle: Path, tmp_path: Path
+    replay, recorded: Path, tiny_bundle: Path, tmp_path: Path
 ) -> None:
     torn = tmp_path / "torn.mcap"
     write_again(recorded, torn)
@@ -208,7 +229,7 @@ def test_a_file_that_breaks_off_is_replayed_up_to_there(
 
 
 @pytest.mark.parametrize("content", [b"", b"no recording", bytes(500)])
-def test_what_is_no_recording_is_said_in_one_line(tmp_path: Path, content: bytes) -> None:
+def test_what_is_no_recording_is_said_in_one_line(replay, tmp_path: Path, content: bytes) -> None:
     (tmp_path / "a.mcap").write_bytes(content)
     result = replay(tmp_path / "a.mcap")
     assert (result.returncode, result.stdout) == (2, "")
@@ -216,7 +237,7 @@ def test_what_is_no_recording_is_said_in_one_line(tmp_path: Path, content: bytes
     assert line.endswith("a.mcap: no recording of lagnet-serve")
 
 
-def test_what_cannot_be_read_or_written_is_said_in_one_line(own: Path, tiny_bundle: Path) -> None:
+def test_what_cannot_be_read_or_written_is_said_in_one_line(replay, own: Path, tiny_bundle: Path) -> None:
     for words, named in (
         ([own.parent / "none.mcap"], "none.mcap: No such file"),
         ([own.parent], "Is a directory"),
@@ -229,7 +250,9 @@ def test_what_cannot_be_read_or_written_is_said_in_one_line(own: Path, tiny_bund
         assert named in line
 
 
-def test_a_fault_is_recorded_and_is_an_incident(tmp_path: Path, tiny_bundle: Path, observation) -> None:
+def test_a_fault_is_recorded_and_is_an_incident(
+    replay, tmp_path: Path, tiny_bundle: Path, observation
+) -> None:
     """A decision that could not be told: the robot had status 500, and played its plan."""
     broken = Monitor.load(tiny_bundle, "always")
     wanted = Settings(str(tmp_path), 10**9, 10**8, str(tmp_path), 10**9)
