@@ -25,7 +25,7 @@ from recorder.frames import frames
 from recorder.incidents import Incidents
 from recorder.tape import Folder, Recording
 
-_NICENESS = 5
+_NICENESS = 10
 """By how much the service comes first where there are too few processors."""
 _TELL_SECONDS = 0.2
 _KILLED = "the service ended without a word"

@@ -24,8 +24,9 @@ HAND_ON_SECONDS = 0.05
 MOST_WAITING = 64 << 20
 """Bytes that may wait to be handed on; what comes on top is dropped, and counted."""
 _START_SECONDS = 30.0
-_END_SECONDS = 10.0
+_END_SECONDS = 5.0
 _QUIET_SECONDS = 60.0
+_PIPE = 1 << 20
 
 _LOG = logging.getLogger("lagnet.recorder")
 
@@ -82,6 +83,7 @@ class Recorder:
         self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
         self._pipe = cast(IO[bytes], self._process.stdin)
         self._words = cast(IO[bytes], self._process.stdout)
+        _widen(self._pipe)
         self._listener = Thread(target=self._listen, name="recorder listens", daemon=True)
         self._listener.start()
         self._send(asdict(settings) | {"about": about})
@@ -202,3 +204,12 @@ class Recorder:
         if what not in self._stopped:
             self._stopped = self._stopped | {what: why}
             _LOG.error("%s stopped: %s; the service goes on", what, why)
+
+
+def _widen(pipe: IO[bytes]) -> None:
+    """Lets a pipe hold more, where that can be set: what it holds outlives a service that is killed."""
+    if sys.platform == "linux":
+        import fcntl
+
+        with suppress(OSError):
+            fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, _PIPE)

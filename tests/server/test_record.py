@@ -124,7 +124,6 @@ def test_kill_9_loses_at_most_the_last_second(tiny_bundle: Path, tmp_path: Path,
     assert all(at > killed - 1.0 for at, *_ in robot.told[count:])
     if not everyone:
         # The recorder goes on for as long as it takes, and says what it saw.
-        assert count >= len(robot.told) - 40
         [incident] = of_kind(tmp_path / "tapes", "incident")
         reader, before = read(incident)
         assert "without a word" in reader.incident["reason"]
