@@ -10,7 +10,7 @@ from __future__ import annotations
 import csv
 import itertools
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -21,7 +21,7 @@ import tyro
 from numpy.typing import NDArray
 
 from decision import MEMORY, Decisions, Origin
-from filter import BarrierFilter, FilterConfig
+from filter import BarrierFilter, FilterConfig, Robot
 from guide import DEFAULT_STRENGTH, STRENGTHS, Guide, Strength
 from pointgoal import seeds
 from pointgoal.lidar import encode, nearest
@@ -35,6 +35,8 @@ Policy = Callable[[FloatArray, FloatArray, np.random.Generator], FloatArray]
 Source = Literal["given", "lidar"]
 Gate = Literal["always", "floor", "none"]
 EPISODE_STEPS = 1000
+LARGEST = np.array([Robot().force_limit, 1.0])
+"""Largest thrust and turn that have an effect."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +51,10 @@ class Off:
         gaussian: whether the bounds are standard deviations of normal errors instead.
         bin: what is wrong with one bin of each robot's hazard lidar: it shows nothing, half of what it
             should, or always 0.3.
+        old: how many control steps old observations are, and given hazards with them.
+        late: how many control steps late actions are.
+        lost: share of the actions that do not arrive: the one before stays.
+        shaken: standard deviation of a normal error of the actions, as a share of the largest.
     """
 
     mass: float = 1.0
@@ -60,6 +66,10 @@ class Off:
     speed: float = 0.0
     gaussian: bool = False
     bin: Literal["", "dead", "half", "stuck"] = ""
+    old: int = 0
+    late: int = 0
+    lost: float = 0.0
+    shaken: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -207,6 +217,33 @@ def _with_faults(observation: FloatArray, off: Off, faulty: NDArray[np.bool_]) -
     return observation
 
 
+class _Late:
+    """What N robots are observed as, and what arrives of what they are sent, too late or not at all."""
+
+    def __init__(self, off: Off, n: int, rng: np.random.Generator) -> None:
+        self._off = off
+        self._rng = rng
+        self._seen: deque[tuple[FloatArray, FloatArray]] = deque(maxlen=off.old + 1)
+        self._sent = deque([np.zeros((n, 2))] * off.late)
+        self._last = np.zeros((n, 2))
+
+    def observed(self, observation: FloatArray, hazards: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The oldest observation (N, O) and hazards that are on the way; at first all are the first one."""
+        self._seen.append((observation, hazards))
+        return self._seen[0]
+
+    def arrives(self, action: FloatArray) -> FloatArray:
+        """What takes effect (N, 2) when an action is sent."""
+        self._sent.append(action)
+        action = self._sent.popleft()
+        if self._off.lost:
+            action = np.where(self._rng.random(len(action))[:, None] < self._off.lost, self._last, action)
+        self._last = action
+        if not self._off.shaken:
+            return action
+        return action + self._off.shaken * LARGEST * self._rng.normal(size=action.shape)
+
+
 def run(line: Line, episodes: int, seed: int = 0, chunk: int = 512) -> Outcome:
     """Run the episodes of one line."""
     rows, rng = seeds.rows(Use.FILTER, seed, episodes), seeds.generator(Use.FILTER, seed)
@@ -240,23 +277,24 @@ def _run(line: Line, rows: list[int], rng: np.random.Generator) -> Outcome:
     if off.bin:
         faulty[np.arange(n), rng.integers(0, LIDAR_BINS, n)] = True
     decided: Decisions | None = None
+    late = _Late(off, n, rng)
 
     def act(observation: FloatArray, env: Any) -> FloatArray:
         nonlocal memory, decided, spent
-        hazards = env.hazards_in_body_frame()
+        observation, hazards = late.observed(observation, env.hazards_in_body_frame())
         seen, shown = _perturbed(observation, hazards, off, rng) if noisy else (observation, hazards)
         if off.bin:
             seen = _with_faults(seen, off, faulty)
         action = np.clip(policy(seen, shown, rng), -1.0, 1.0)
         if line.gate == "none":
-            return action
+            return late.arrives(action)
         start = time.perf_counter()
-        view = robot_filter.look(seen, shown if line.source == "given" else None)
+        view = robot_filter.look(seen, shown if line.source == "given" else None, memory)
         active = np.ones(n, bool) if line.gate == "always" else view.low
         decided = robot_filter.decide(view, action, memory, active)
         spent += time.perf_counter() - start
         memory = decided.memory if line.memory else memory
-        return decided.action
+        return late.arrives(decided.action)
 
     for step in drive(env, act, rows):
         alive = step.running
@@ -311,6 +349,7 @@ COMBINATIONS = tuple(
     Off(mass, drag, thrust, turning)
     for mass, drag, thrust, turning in itertools.product((0.9, 1.1), repeat=4)
 )
+DELAYS = (1, 2, 3)
 NOISE = (Off(distance=0.002, bearing=float(np.radians(2.0)), speed=0.02),)
 WORLDS = {
     "plain": World(),
@@ -324,6 +363,14 @@ WORLDS = {
     "a dead bin": World(off=(Off(bin="dead"),)),
     "a bin at half": World(off=(Off(bin="half"),)),
     "a stuck bin": World(off=(Off(bin="stuck"),)),
+    **{f"observations {n} steps old": World(FilterConfig(delay_steps=n), off=(Off(old=n),)) for n in DELAYS},
+    **{f"actions {n} steps late": World(FilterConfig(delay_steps=n), off=(Off(late=n),)) for n in DELAYS},
+    **{f"observations {n} steps old, not told": World(off=(Off(old=n),)) for n in DELAYS},
+    **{f"actions {n} steps late, not told": World(off=(Off(late=n),)) for n in DELAYS},
+    "2 % of actions lost": World(off=(Off(lost=0.02),)),
+    "10 % of actions lost": World(off=(Off(lost=0.1),)),
+    "actions shaken by 0.1": World(off=(Off(shaken=0.1),)),
+    "actions shaken, ready": World(ROBUST, off=(Off(shaken=0.1),)),
     "ready for noise": World(NOISY),
     "ready for a robot off": World(ROBUST),
 }
@@ -353,6 +400,21 @@ def lines() -> Iterator[Line]:
     settings = ("margin 3 mm", "margin 2 cm", "margin 4 cm", "ready for noise", "ready for a robot off")
     for world, source in itertools.product(settings, SOURCES):
         yield Line(REWARD_ONLY, world, source, "always", DEFAULT_STRENGTH)
+    yield from late_lines()
+
+
+def late_lines() -> Iterator[Line]:
+    """Late and lost: delays that the filter is told of, then what it is not."""
+    told = [world for world in WORLDS if world.endswith(("steps old", "steps late"))]
+    policies = (REWARD_ONLY, "random", "thrust", "attacker")
+    for world, policy, source in itertools.product(told, policies, SOURCES):
+        yield Line(policy, world, source, "always", DEFAULT_STRENGTH)
+    for world in told:
+        yield Line(SHIPPED, world, "lidar", "always", DEFAULT_STRENGTH)
+        yield Line(SHIPPED, world, "given", "none", "off")
+    not_told = [world for world in WORLDS if world.endswith(("not told", "lost", "shaken by 0.1", "ready"))]
+    for world, policy in itertools.product(not_told, (REWARD_ONLY, "attacker")):
+        yield Line(policy, world, "lidar", "always", DEFAULT_STRENGTH)
 
 
 @dataclass

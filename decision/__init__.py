@@ -10,21 +10,28 @@ from decision.fallback import fall_back
 from decision.faults import Faults
 from decision.hazards import hazards_of_one
 from decision.memory import (
+    HISTORY,
     MEMORY,
+    MOST_LATE,
     MOST_OPEN,
     PLAN_STEPS,
+    SENSED,
     Memory,
     memory_from_json,
     memory_of,
     memory_to_json,
     next_of_plan,
+    remember_sent,
 )
 
 __all__ = [
+    "HISTORY",
     "MEMORY",
+    "MOST_LATE",
     "MOST_OPEN",
     "PLAN_STEPS",
     "SAFE_ACTION",
+    "SENSED",
     "BatchDecider",
     "Decider",
     "Decision",
@@ -40,6 +47,7 @@ __all__ = [
     "memory_of",
     "memory_to_json",
     "next_of_plan",
+    "remember_sent",
     "texts",
     "unknown",
 ]

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from decision.decision import SAFE_ACTION, Decisions, Mode, OpenedBy, Origin
-from decision.memory import Memory, next_of_plan
+from decision.memory import Memory, next_of_plan, remember_sent
 
 
 def fall_back(
@@ -25,8 +25,10 @@ def fall_back(
     """
     count = len(memory)
     action, after = next_of_plan(memory)
+    action = np.where((memory["left"] > 0)[:, None], action, np.asarray(safe, np.float64))
+    remember_sent(after, action)
     return Decisions(
-        action=np.where((memory["left"] > 0)[:, None], action, np.asarray(safe, np.float64)),
+        action=action,
         nominal_action=np.full((count, 2), np.nan),
         mode=np.full(count, Mode.FALLBACK),
         origin=np.full(count, Origin.PLAN),

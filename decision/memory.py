@@ -2,17 +2,37 @@
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 PLAN_STEPS = 20
 """Control steps for which a plan thrusts at most: 0.4 s; a full brake from top speed takes 0.36 s."""
 
+SENSED = 60
+"""Numbers of an observation that are remembered, at most."""
+
 MOST_OPEN = 1000
 """Control steps for which a gate stays open at most: 20 s."""
+
+MOST_LATE = 5
+"""Control steps by which an action's effect may be late at most, see `filter.FilterConfig.delay_steps`."""
+
+HISTORY = np.dtype(
+    [("sent", "f4", (MOST_LATE + 1, 2)), ("sensed", "f4", (SENSED,)), ("age", "i8")],
+    align=True,
+)
+"""What a robot was sent and what it saw, to compare with what it sees next.
+
+- ``sent``: the last actions, the newest first.
+- ``sensed``: the last observation, as long as it is; zeros behind it.
+- ``age``: for how many control steps it is the last one; 0: there is none.
+"""
+
+_NO_HISTORY = bytes(HISTORY.itemsize)
 
 MEMORY = np.dtype(
     [
@@ -22,6 +42,7 @@ MEMORY = np.dtype(
         ("open", "i2"),
         ("guided", "i1"),
         ("planned", "?"),
+        ("history", HISTORY),
     ],
     align=True,
 )
@@ -33,6 +54,7 @@ MEMORY = np.dtype(
 - ``guided``: the side on which the guide is leading the robot past something, 1 left, -1 right, else 0.
 - ``planned``: whether there is a certified plan; one without actions is to coast.
 - ``left``: how many actions of the plan are left.
+- ``history``: see `HISTORY`.
 - ``plan``: (PLAN_STEPS, 2) what is left of the certified backup, action by action; after it the robot coasts.
 """
 
@@ -50,7 +72,7 @@ def memory_of(count: int, memory: Memory | np.void | None) -> Memory:
         return np.zeros(count, MEMORY)
     if getattr(memory, "dtype", None) != MEMORY or memory.size != count:
         raise ValueError(f"the memory is not that of {count} robot{'s' * (count != 1)}")
-    return np.asarray(memory).reshape(count)
+    return np.ascontiguousarray(memory).reshape(count)
 
 
 def next_of_plan(memory: Memory) -> tuple[NDArray[np.float64], Memory]:
@@ -68,13 +90,22 @@ def next_of_plan(memory: Memory) -> tuple[NDArray[np.float64], Memory]:
     return action, after
 
 
+def remember_sent(memory: Memory, action: ArrayLike) -> None:
+    """Write down what N robots are sent (N, 2), in a control step in which nothing new was seen."""
+    history = memory["history"]
+    history["sent"][:, 1:] = history["sent"][:, :-1].copy()
+    history["sent"][:, 0] = action
+    history["age"] += history["age"] > 0
+
+
 def memory_to_json(memory: np.void) -> dict[str, Any]:
     """One robot's memory as plain JSON, to be handed back with the next observation."""
-    left = int(memory["left"])
+    left, history = int(memory["left"]), memory["history"].tobytes()
     return {
         "side": int(memory["side"]),
         "guided": int(memory["guided"]),
         "open": int(memory["open"]),
+        "history": "" if history == _NO_HISTORY else base64.b64encode(history).decode("ascii"),
         "plan": memory["plan"][:left].tolist() if memory["planned"] else None,
     }
 
@@ -86,13 +117,15 @@ def memory_from_json(value: Mapping[str, Any]) -> Memory:
         ValueError: if the value is not a memory that this version wrote; the message names the field.
     """
     memory = np.zeros(1, MEMORY)
-    if set(value) != {"side", "guided", "open", "plan"}:
-        raise ValueError(f"memory has the fields {sorted(value)}, expected guided, open, plan, side")
+    if set(value) | {"history"} != {"side", "guided", "open", "plan", "history"}:
+        raise ValueError(f"memory has the fields {sorted(value)}, expected guided, history, open, plan, side")
     for name, least, most in (("side", -127, 127), ("guided", -1, 1), ("open", 0, MOST_OPEN)):
         number = value[name]
         if isinstance(number, bool) or not isinstance(number, int) or not least <= number <= most:
             raise ValueError(f"memory.{name} must be a whole number in {least}..{most}, got {number!r}")
         memory[name] = number
+    if value.get("history", "") != "":
+        memory["history"] = _history(value["history"])
     if value["plan"] is None:
         return memory
     plan = value["plan"]
@@ -102,6 +135,22 @@ def memory_from_json(value: Mapping[str, Any]) -> Memory:
     for step, action in enumerate(plan):
         memory["plan"][0, step] = action
     return memory
+
+
+def _history(value: object) -> np.void:
+    """The inverse of its base64, or ValueError."""
+    try:
+        data = base64.b64decode(value, validate=True) if isinstance(value, str) else b""
+    except ValueError:
+        data = b""
+    if len(data) != HISTORY.itemsize:
+        raise ValueError(f"memory.history must be the base64 of {HISTORY.itemsize} bytes")
+    history: np.void = np.frombuffer(data, HISTORY)[0]
+    sizes = np.abs(np.frombuffer(data, np.float32, 2 * (MOST_LATE + 1) + SENSED))
+    sound = sizes.max() < np.inf and sizes[: 2 * (MOST_LATE + 1)].max() <= 1.0 and history["age"] >= 0
+    if not sound:  # NaN is neither
+        raise ValueError("memory.history has numbers that no robot is sent or sees")
+    return history
 
 
 def _is_action(pair: object) -> bool:

@@ -85,22 +85,27 @@ class BarrierFilter:
         gate = scene.check_active(active, n)
         past = scene.check_memory(memory, n)
         if n <= _CHUNK:
-            decisions = self.decide(scene.look(self._settings, seen, given), nominal, past, gate)
+            decisions = self.decide(scene.look(self._settings, seen, given, past), nominal, past, gate)
         else:
             parts = []
             for start in range(0, n, _CHUNK):
                 part = slice(start, start + _CHUNK)
-                view = scene.look(self._settings, seen[part], None if given is None else given[part])
+                near = None if given is None else given[part]
+                view = scene.look(self._settings, seen[part], near, past[part])
                 parts.append(self.decide(view, nominal[part], past[part], gate[part]))
             decisions = Decisions.join(parts)
         if active is not None:
             decisions.opened_by = np.where(gate, decisions.opened_by, "")
         return decisions
 
-    def look(self, observation: ArrayLike, hazards: ArrayLike | None = None) -> Scene:
+    def look(
+        self, observation: ArrayLike, hazards: ArrayLike | None = None, memory: Memory | None = None
+    ) -> Scene:
         """What N robots see, and the barrier; arguments and errors as for `filter`."""
         seen = scene.check_observation(observation)
-        return scene.look(self._settings, seen, scene.check_hazards(hazards, len(seen)))
+        n = len(seen)
+        near, past = scene.check_hazards(hazards, n), scene.check_memory(memory, n)
+        return scene.look(self._settings, seen, near, past)
 
     def decide(self, view: Scene, nominal: FloatArray, memory: Memory, active: BoolArray) -> Decisions:
         """Filter N actions for what is seen; arguments as for `filter`, all of them there and checked.

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from decision import MOST_LATE
 from pointgoal.observation import HAZARD_RADIUS
 from system.point_robot import ROBOT, Robot
 
@@ -53,6 +54,10 @@ class FilterConfig:
     """How far along the way past an obstacle the circulation row steers the stop point to [m]."""
     slow: float = 0.1
     """A robot whose stop point is nearer than this hardly moves [m]."""
+    delay_steps: int = 0
+    """Control steps from an observation until the action that is decided on it takes effect, beyond the usual
+    one: how old observations are and how late actions are, together. The filter predicts through the actions
+    that are under way."""
     solver: str = "planar"
     """QP solver: "planar" (ours), "osqp" (kept workspace) or any that qpsolvers knows."""
     robot: Robot | None = None
@@ -70,6 +75,8 @@ class FilterConfig:
         for name in ("circulation", "slow"):
             if not 0.0 <= getattr(self, name) < 100.0:
                 raise ValueError(f"{name} must be in [0, 100), got {getattr(self, name)!r}")
+        if not (isinstance(self.delay_steps, int) and 0 <= self.delay_steps <= MOST_LATE):
+            raise ValueError(f"delay_steps must be 0 to {MOST_LATE}, whole, got {self.delay_steps!r}")
         if not 0.0 < self.rate <= 1.0:
             raise ValueError(f"rate must be in (0, 1], got {self.rate!r}")
 
@@ -78,7 +85,9 @@ _NUMBERS = (
     *("margin", "sure", "bearing_error", "position_error", "travel_error", "hazard_radius", "rate"),
     *("keep_off", "hysteresis", "thrust_weight", "circulation", "pursuit", "slow"),
 )
-SETTINGS = np.dtype([("robot", ROBOT), *((name, "f8") for name in _NUMBERS)], align=True)
+SETTINGS = np.dtype(
+    [("robot", ROBOT), ("delay_steps", "i8"), *((name, "f8") for name in _NUMBERS)], align=True
+)
 """`FilterConfig`'s numbers as compiled code takes them: ``margin`` holds the position error as well, ``sure``
 is what is kept whatever happens. An array of one: numba passes it fifty times as fast as a tuple."""
 
@@ -90,6 +99,7 @@ def settings(config: FilterConfig) -> NDArray[np.void]:
     """The numbers of a configuration: (1,) of `SETTINGS`."""
     made = np.zeros(1, SETTINGS)
     made["robot"] = tuple(config.robot or Robot())
+    made["delay_steps"] = config.delay_steps
     made["hazard_radius"] = HAZARD_RADIUS if config.hazard_radius is None else config.hazard_radius
     for name in set(_NUMBERS) - {"margin", "sure", "hazard_radius"}:
         made[name] = getattr(config, name)

@@ -8,12 +8,11 @@ All take ``settings`` (1,) of `SETTINGS` and arrays with a row for each of N rob
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from decision import PLAN_STEPS
+from decision import MOST_LATE
 from filter.certificate import CERTIFICATE
 from filter.certificate import certify as certify_one
 from filter.circulation import circulate
@@ -21,12 +20,13 @@ from filter.config import Settings
 from filter.qp import after, barrier_rows
 from filter.recovery import commit, drive_out
 from pointgoal.observation import LIDAR_RANGE
-from system.backups import law
+from system.backups import law, write_plan
 from system.clearance import best_backup, clearances
 from system.compiled import compiled, entry
-from system.lidar import contradictory, decode, unexplained
+from system.lidar import contradictory
 from system.obstacles import FAR, least_gap
-from system.point_robot import State, advance, follow, stopping
+from system.point_robot import State, once_arrived, stopping
+from system.surroundings import in_own_frame, surroundings
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -35,6 +35,9 @@ Records = NDArray[np.void]
 
 SEEN = np.dtype(
     [
+        ("x", "f8"),
+        ("y", "f8"),
+        ("heading", "f8"),
         ("vx", "f8"),
         ("vy", "f8"),
         ("yaw_rate", "f8"),
@@ -44,9 +47,10 @@ SEEN = np.dtype(
     ],
     align=True,
 )
-"""One robot as the filter sees it: its velocity ahead and to the left [m/s], its yaw rate [rad/s], how many
-obstacles are within reach; its best backup from here, whose clearance is the barrier; and a backup whose
-clearance is at least 0 after what any one action might cost it, if there is one."""
+"""One robot when its next action takes effect, as the filter sees it: where that is, from where it was seen
+[m, rad]; its velocity ahead and to the left [m/s], its yaw rate [rad/s]; how many obstacles are within reach;
+its best backup from there, whose clearance is the barrier; and a backup whose clearance is at least 0 after
+what any one action might cost it, if there is one."""
 COMMITTED, UNKEPT, INSIDE = 0, 1, 2
 """What `recover` finds: a backup that keeps the inner margin; one that does not; a robot inside a hazard."""
 _GRID = 5
@@ -56,8 +60,6 @@ _SCAN = 1e-3
 """Contradiction between three readings that is let pass beside their errors: 3 mm."""
 _STANDS = 0.03
 """Way to the stop point up to which a robot stands [m]: 6 cm/s."""
-_THRUST_TIME = 0.02 * (PLAN_STEPS + 1)
-"""Longest thrust in a certificate [s]."""
 
 
 @compiled
@@ -66,38 +68,13 @@ def _state(seen: Settings) -> State:
     return State(0.0, 0.0, 0.0, seen.vx, seen.vy, seen.yaw_rate)
 
 
-@compiled
-def _obstacles(
-    config: Settings, state: State, given: FloatArray, readings: FloatArray, out: FloatArray, source: IntArray
-) -> int:
-    """The obstacles within one step and any backup, given ones and what of a scan these do not explain."""
-    robot = config.robot
-    speed = math.hypot(state.vx, state.vy) + robot.offset * abs(state.yaw_rate)
-    thrust = robot.gear * robot.force_limit / robot.drag * _THRUST_TIME
-    reach = robot.mass / robot.drag * speed + thrust + 0.05
-    count = 0
-    for i in range(given.shape[0]):
-        x, y = given[i]
-        distance = math.hypot(x, y)
-        radius = config.hazard_radius + config.margin + config.bearing_error * distance
-        # Not so for a NaN, which marks an absent hazard.
-        if distance - radius <= reach:
-            out[count] = (x, y, 0.0, 0.0, radius, 0.0, distance - radius)
-            source[count] = i
-            count += 1
-    if readings.size == 0:
-        return count
-    grow = config.hazard_radius + config.margin
-    wanted = unexplained(readings, given, config.position_error, config.bearing_error)
-    return decode(readings, wanted, reach + grow, grow, config.bearing_error, out, source, count, len(given))
-
-
 @entry
 def see(
     settings: Records,
     observation: FloatArray,
     columns: tuple[int, int, int, int, int],
     given: FloatArray,
+    memory: Records,
     seen: Records,
     obstacles: FloatArray,
     source: IntArray,
@@ -106,9 +83,9 @@ def see(
 
     ``columns`` tells where in an ``observation`` (N, O) the velocity ahead, followed by that to the left,
     and the yaw rate stand, where the hazards' lidar starts and ends, and where the goal's starts. ``given``
-    (N, n, 2) are hazards [m]; ``source`` (N, M) receives each obstacle's hazard, or n + its bin. Returns the
-    place of the first number of all observations that float32 cannot hold, -1 if there is none. A robot whose
-    scan contradicts itself has a barrier of NaN.
+    (N, n, 2) are hazards [m]; what is under way stands in ``memory`` (N,); ``source`` (N, M) receives each
+    obstacle's hazard, or n + its bin. Returns the place of the first number of all observations that float32
+    cannot hold, -1 if there is none. A robot whose scan contradicts itself has a barrier of NaN.
     """
     config = settings[0]
     velocity, yaw, first, last, _ = columns
@@ -117,18 +94,22 @@ def see(
             if not abs(observation[k, i]) <= _LARGEST:
                 return int(k * observation.shape[1] + i)
         one = seen[k]
-        one.vx = observation[k, velocity]
-        one.vy = observation[k, velocity + 1]
-        one.yaw_rate = observation[k, yaw]
-        state = _state(one)
+        coming = State(
+            0.0, 0.0, 0.0, observation[k, velocity], observation[k, velocity + 1], observation[k, yaw]
+        )
+        one.x, one.y, one.heading, one.vx, one.vy, one.yaw_rate = coming
+        if config.delay_steps > 0:
+            coming = once_arrived(config.robot, coming, memory[k].history.sent, config.delay_steps)
+            one.x, one.y, one.heading, _, _, one.yaw_rate = coming
+            one.vx, one.vy = in_own_frame(coming.x + coming.vx, coming.y + coming.vy, coming)
         readings = observation[k, first:last]
         if contradictory(readings, _SCAN + 3.0 * config.position_error / LIDAR_RANGE):
             one.count = 0
             one.now.clearance, one.now.nearest, one.now.backup, one.now.steps = math.nan, -1, 0, 0
             one.sure.clearance, one.sure.nearest, one.sure.backup, one.sure.steps = -FAR, -1, 0, 0
             continue
-        one.count = _obstacles(config, state, given[k], readings, obstacles[k], source[k])
-        at = stopping(config.robot, state)
+        one.count = surroundings(config, coming, given[k], readings, obstacles[k], source[k])
+        at = stopping(config.robot, _state(one))
         now = best_backup(config, obstacles[k], one.count, at, FAR, False)
         one.now.clearance = min(now[0], LIDAR_RANGE)
         one.now.nearest, one.now.backup, one.now.steps = now[1:]
@@ -151,7 +132,7 @@ def screen(
     """Look for certificates of the nominal actions (N, 2) where the gate is open; how many have none.
 
     Where ``active`` (N,) is False, the sure backup stands for one. ``certified`` (N,) receives which have
-    one; in ``memory`` (N,) a remembered side fades, and the plans are written down.
+    one; in ``memory`` (N,) a remembered side fades, and the plans and actions are written down.
     """
     config = settings[0]
     refused = 0
@@ -170,25 +151,14 @@ def screen(
             one.backup, one.steps = sure.backup, sure.steps
         past = memory[k]
         past.side -= (past.side > 0) - (past.side < 0)
+        sent = past.history.sent
+        for i in range(MOST_LATE, 0, -1):
+            sent[i] = sent[i - 1]
+        sent[0, 0], sent[0, 1] = u1, u2
         past.planned = certified[k] or (not active[k] and one.clearance >= 0.0)
-        _plan(config, state, u1, u2, one.backup, one.steps, past)
+        past.left = one.steps
+        write_plan(config.robot, state, u1, u2, one.backup, one.steps, past.plan)
     return refused
-
-
-@compiled
-def _plan(config: Settings, state: State, u1: float, u2: float, backup: int, steps: int, memory: Any) -> None:
-    """Write down, action by action, a backup from where an action leads."""
-    plan = memory.plan
-    plan[:] = 0.0
-    memory.left = steps
-    if steps > 0:
-        robot = config.robot
-        at = stopping(robot, advance(robot, state, u1, u2, robot.substeps))
-        for step in range(steps):
-            thrust, turn = law(robot, backup, at)
-            at = follow(robot, at, thrust, turn)
-            plan[step, 0] = thrust * robot.force_limit
-            plan[step, 1] = turn
 
 
 @entry
@@ -377,4 +347,6 @@ def keep_plans(
             continue
         one, past = certificates[k], memory[k]
         past.planned = True
-        _plan(settings[0], _state(seen[k]), action[k, 0], action[k, 1], one.backup, one.steps, past)
+        past.left = one.steps
+        u1, u2 = action[k]
+        write_plan(settings[0].robot, _state(seen[k]), u1, u2, one.backup, one.steps, past.plan)

@@ -51,9 +51,10 @@ class Scene:
     Attributes:
         observation: (N, O).
         columns: where the filter's numbers stand in it, see `kernel.see`.
-        given: (N, n, 2) hazards [m].
+        given: (N, n, 2) hazards [m], in the frame of the observation as well.
         seen: (N,) of `kernel.SEEN`: motion, count of obstacles, best backup.
-        obstacles: (N, M, COLUMNS); of each robot's, the first ``seen["count"]`` count.
+        obstacles: (N, M, COLUMNS), from where the next action takes effect; of each robot's, the first
+            ``seen["count"]`` count.
         source: (N, M) each one's hazard, or, behind those, its lidar bin.
         doubted: (N,) whether the hazards' lidar contradicts itself; their barrier is NaN.
     """
@@ -87,11 +88,13 @@ class Scene:
         return low
 
 
-def look(settings: NDArray[np.void], observation: FloatArray, given: FloatArray | None) -> Scene:
+def look(
+    settings: NDArray[np.void], observation: FloatArray, given: FloatArray | None, memory: Memory
+) -> Scene:
     """Find obstacles and best backups.
 
-    ``observation`` is (N, 60) or (N, 28), ``given`` (N, n, 2) hazards [m] or None; a value of the observation
-    that is not finite raises FilterInputError.
+    ``observation`` is (N, 60) or (N, 28), ``given`` (N, n, 2) hazards [m] or None, ``memory`` (N,); a value
+    of the observation that is not finite raises FilterInputError.
     """
     n, width = observation.shape
     columns = _COLUMNS[width]
@@ -100,7 +103,7 @@ def look(settings: NDArray[np.void], observation: FloatArray, given: FloatArray 
     size = given.shape[1] + (CONES if columns.hazards.stop else 0)
     seen = np.empty(n, SEEN)
     obstacles, source = np.empty((n, size, COLUMNS)), np.empty((n, size), dtype=np.int64)
-    bad = see(settings, observation, columns.read, given, seen, obstacles, source)
+    bad = see(settings, observation, columns.read, given, memory, seen, obstacles, source)
     if bad >= 0:
         raise FilterInputError(f"observation[{bad % width}]", f"must be finite, got {observation.flat[bad]}")
     doubted = np.isnan(seen["now"]["clearance"])

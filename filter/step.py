@@ -105,7 +105,8 @@ class Step:
         outcome = np.empty(len(rows), np.int8)
         radius = self.settings["hazard_radius"][0]
         with np.errstate(invalid="ignore"):
-            away = np.hypot(scene.given[rows, :, 0], scene.given[rows, :, 1])
+            seen = scene.seen[rows]
+            away = np.hypot(*(scene.given[rows] - np.stack([seen["x"], seen["y"]], 1)[:, None]).T).T
         edge = np.fmin.reduce(away, axis=1, initial=np.inf)
         if scene.readings.shape[1]:
             # A scan tells how far the nearest hazard is, though not where.
@@ -151,7 +152,9 @@ class Step:
     def go_on(self, rows: IntArray, reason: str) -> None:
         """Send the next action of some rows' plans."""
         if rows.size:
-            action, self.memory[rows] = next_of_plan(self._before[rows])
+            action, after = next_of_plan(self._before[rows])
+            after["history"] = self.memory["history"][rows]
+            self.memory[rows] = after
             self.send(rows, action, Mode.FALLBACK, Origin.PLAN, reason)
             self._settled(rows)
 
@@ -179,6 +182,7 @@ class Step:
         """The step, decided, and the plans that the certificates end in written down."""
         n, memory = len(self.action), self.memory
         if self._open is not None:
+            memory["history"]["sent"][:, 0] = self.action
             sent = self._open, self.action, self.certificates
             kernel.keep_plans(self.settings, self.scene.seen, *sent, memory)
         return Decisions(

@@ -16,6 +16,7 @@ from pointgoal.observation import LIDAR_BINS
 from system.compiled import compiled, entry
 from system.lidar import decode_goal, likeliest, unexplained
 from system.point_robot import ROBOT, State, stopping
+from system.surroundings import in_own_frame
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -218,6 +219,13 @@ def lead(
         state = State(0.0, 0.0, 0.0, seen[k].vx, seen[k].vy, seen[k].yaw_rate)
         count = _discs(config, given[k], observation[k, first:last], discs, source)
         at = decode_goal(observation[k, goal : goal + LIDAR_BINS])
+        # Seen where the robot was observed; it drives from where its next action takes effect.
+        there = State(seen[k].x, seen[k].y, seen[k].heading, 0.0, 0.0, 0.0)
+        if there.x != 0.0 or there.y != 0.0 or there.heading != 0.0:
+            for i in range(count):
+                discs[i, 0], discs[i, 1] = in_own_frame(discs[i, 0], discs[i, 1], there)
+            goal_x, goal_y = in_own_frame(at[1], at[2], there)
+            at = (at[0], goal_x, goal_y)
         engaged = ahead or past.guided != 0
         leads[k], led, way = _leads(
             config, discs, count, at, state, proposed[k], not certified[k], engaged, ahead, past.guided

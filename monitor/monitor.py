@@ -38,7 +38,9 @@ from pointgoal.observation import layout
 class ActionFilter(Protocol):
     """What the monitor needs of a filter; `filter.BarrierFilter` is one."""
 
-    def look(self, observation: ArrayLike, hazards: ArrayLike | None = None) -> Scene:
+    def look(
+        self, observation: ArrayLike, hazards: ArrayLike | None = None, memory: Memory | None = None
+    ) -> Scene:
         """What N robots see."""
 
     def decide(self, scene: Scene, nominal: FloatArray, memory: Memory, active: BoolArray) -> Decisions:
@@ -196,7 +198,7 @@ class Monitor:
         size = self._networks.observation_size
         if observation.shape[1:] != (size,):
             raise FilterInputError("observation", f"must have {size} numbers, got {observation.shape[1:]}")
-        scene = self._filter.look(observation, hazards)
+        scene = self._filter.look(observation, hazards, memory)
         nominal, risk = self._networks.run(observation)
         if nominal.shape != (len(observation), 2) or risk.shape != nominal.shape[:1]:
             raise NetworkError(f"the networks gave shapes {nominal.shape} and {risk.shape}")

@@ -50,6 +50,7 @@ class Reader:
 
     Attributes:
         model: what decided, as `GET /model` told it.
+        filter_config: the settings of its filter.
         incident: why and when there was an incident; None in other files.
         ended: whether the file's end was found; without, its writer was killed or the disk full.
         damaged: how many stretches of the file could not be read; a stretch is half a second or a megabyte.
@@ -70,7 +71,7 @@ class Reader:
         self._records = self._read()
         self._ahead: list[McapRecord] = []
         try:
-            self.model = self._about()
+            self.model, self.filter_config = self._about()
         except BaseException:
             self.close()
             raise
@@ -105,20 +106,20 @@ class Reader:
         """Closes the file."""
         self.close()
 
-    def _about(self) -> dict[str, Any]:
-        """Reads on to the first message; the model that the metadata before it tell of."""
-        model: dict[str, Any] | None = None
+    def _about(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Reads on to the first message; what the metadata before it tell of."""
+        about: tuple[dict[str, Any], dict[str, Any]] | None = None
         for record in self._records:
             if isinstance(record, Metadata) and record.name == ABOUT:
-                model = json.loads(record.metadata["model"])
+                about = json.loads(record.metadata["model"]), json.loads(record.metadata["filter"])
             elif isinstance(record, Metadata) and record.name == INCIDENT:
                 self.incident = record.metadata
             elif isinstance(record, Channel | Message):
                 self._ahead = [record]
                 break
-        if model is None:
+        if about is None:
             raise RecordingError(f"{self._path}: no recording of lagnet-serve")
-        return model
+        return about
 
     def _together(self) -> Iterator[tuple[int, list[Message]]]:
         """The messages of each exchange: they stand together."""

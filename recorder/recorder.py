@@ -56,6 +56,7 @@ class Recorder:
     Args:
         settings: what and where.
         model: what decides, as `GET /model` tells it.
+        filter_config: the filter's settings, as plain JSON.
 
     Attributes:
         dropped: how many exchanges were not recorded because too many were waiting.
@@ -64,7 +65,9 @@ class Recorder:
         RecordingError: if it cannot start.
     """
 
-    def __init__(self, settings: Settings, model: Mapping[str, Any]) -> None:
+    def __init__(
+        self, settings: Settings, model: Mapping[str, Any], filter_config: Mapping[str, Any]
+    ) -> None:
         self.dropped = 0
         self._stopped: dict[str, str] = {}
         self._status: dict[str, Any] = {}
@@ -76,7 +79,7 @@ class Recorder:
         self._closing, self._ready = Event(), Event()
         self._failed: str | None = None
         release = version("lagnet")
-        text = {"version": release, "model": json.dumps(model)}
+        text = {"version": release, "model": json.dumps(model), "filter": json.dumps(filter_config)}
         about = {"version": release, "text": text, "layout": list(model["observation_layout"])}
         # What it says besides goes where the service's own complaints go.
         command = [sys.executable, "-m", "recorder.process"]

@@ -14,6 +14,7 @@ from pydantic_core import from_json
 from rich.console import Console
 
 from command import command, settings, terminal, why_not_file
+from filter import FilterConfig
 from models import BundleError
 from monitor import Monitor, MonitorError
 from recorder import RecordingError
@@ -39,7 +40,8 @@ class ReplayError(ValueError):
 class ReplayConfig:
     """Shows a recording of lagnet-serve, and decides it again.
 
-    A recording that broke off is read up to there.
+    A recording that broke off is read up to there. Decisions are made again with the gate, threshold, guide
+    and filter of then.
     """
 
     file: Annotated[Path, tyro.conf.Positional]
@@ -75,7 +77,7 @@ class Again:
 
     Args:
         bundle: its folder.
-        model: what decided then, as `GET /model` told it: its gate, threshold and guide are taken.
+        reader: the recording, which tells what decided then: gate, threshold, guide and filter are so again.
 
     Attributes:
         other: what is not as it was then, in words; None if all is.
@@ -86,13 +88,15 @@ class Again:
         RecordingError: if the recording does not say what decided.
     """
 
-    def __init__(self, bundle: Path, model: dict[str, Any]) -> None:
+    def __init__(self, bundle: Path, reader: Reader) -> None:
+        model = reader.model
         try:
             gate, threshold, guide = model["gate"], model["threshold"], model["guide"]
             was, files = model["model"], model["sha256"]
-        except KeyError as error:
-            raise RecordingError(f"the recording does not say which {error.args[0]} decided") from error
-        monitor = Monitor.load(bundle, gate, threshold, guide=guide)
+            filter_config = FilterConfig(**reader.filter_config)
+        except (KeyError, TypeError) as error:
+            raise RecordingError(f"the recording is of another version of lagnet-serve: {error}") from error
+        monitor = Monitor.load(bundle, gate, threshold, filter_config, guide)
         now = ModelReply.of(monitor)
         self._desk = Desk(_nobody, monitor, now)
         self.comparison = Comparison()
@@ -163,7 +167,7 @@ def replay(config: ReplayConfig, console: Console) -> bool:
     except OSError as error:
         raise ReplayError(f"{config.file}: {error.strerror}") from error
     with reader:
-        again = None if config.bundle is None else Again(config.bundle, reader.model)
+        again = None if config.bundle is None else Again(config.bundle, reader)
         timeline = _read(reader, config, again)
     if not timeline.rows:
         raise ReplayError(f"{config.file}: no decision" + _of_robot(config, timeline))

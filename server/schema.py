@@ -41,6 +41,7 @@ class MemoryJson(BaseModel):
         side: the side on which the robot passes what is in its way, and for how long that is remembered.
         guided: whether the guide leads.
         open: for how many more control steps the gate stays open.
+        history: base64 of what the robot was sent and saw, `decision.HISTORY`; empty: nothing yet.
         plan: what is left of the certified plan: the actions that are safe to send next, one a control step,
             if no further reply comes; after them the robot coasts.
     """
@@ -50,6 +51,7 @@ class MemoryJson(BaseModel):
     side: int
     guided: int
     open: int
+    history: str = ""
     plan: Annotated[list[Pair], Field(max_length=PLAN_STEPS)] | None
 
 

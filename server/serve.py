@@ -12,7 +12,7 @@ import socket
 import sys
 import time
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import FrameType
 from typing import Annotated
@@ -21,6 +21,7 @@ import tyro
 import uvicorn
 
 from command import command, settings, why_not_folder
+from filter import FilterConfig
 from models import BundleError
 from monitor import DEFAULT_STRENGTH, GateName, Monitor, MonitorError, Strength
 from recorder import Recorder, RecordingError, Settings
@@ -63,6 +64,16 @@ class ServeConfig:
     """Risk score above which the gate `risk` activates the filter; by default the bundle's."""
     guide: Strength = DEFAULT_STRENGTH
     """How much the guide may do: nothing, lead on from a refused action on, or lead ahead."""
+    margin: float = FilterConfig.margin
+    """What the filter keeps from a hazard's edge for what its model leaves out [m]."""
+    position_error: float = 0.0
+    """Bound on the error of a hazard's measured distance [m]."""
+    bearing_error: float = 0.0
+    """Bound on the error of its bearing [rad]."""
+    travel_error: float = 0.0
+    """Bound on how far the robot strays from the filter's model, as a share of its way."""
+    delay_steps: int = 0
+    """How old observations are and how late actions take effect, together, in control steps."""
     api_key_file: Path | None = None
     """File that holds the key; otherwise the environment variable LAGNET_API_KEY."""
     max_body: int = MAX_BODY
@@ -87,8 +98,18 @@ class ServeConfig:
     incidents_mb: float = 256.0
     """Size of all files of incidents in it [MB]; where they come to more, the oldest go."""
 
+    def filter_config(self) -> FilterConfig:
+        """The filter's settings, or ServeError for one that is out of its range."""
+        names = ("margin", "position_error", "bearing_error", "travel_error", "delay_steps")
+        try:
+            return FilterConfig(**{name: getattr(self, name) for name in names})
+        except ValueError as error:
+            name, _, rest = str(error).partition(" ")
+            raise ServeError(f"--{name.replace('_', '-')} {rest}") from error
+
     def check(self) -> None:
         """Raises ServeError for what no service can be started with."""
+        self.filter_config()
         if not 0 <= self.port <= 65535:
             raise ServeError(f"--port must be 0 to 65535, got {self.port}")
         if self.max_body < 1 or self.max_connections < 1:
@@ -250,7 +271,9 @@ def serve(config: ServeConfig) -> None:
     allow_files(config.max_connections)
     listener = listen(config.host, config.port, api_key)
     with listener:
-        monitor = Monitor.load(config.bundle, config.gate, config.threshold, guide=config.guide)
+        monitor = Monitor.load(
+            config.bundle, config.gate, config.threshold, config.filter_config(), config.guide
+        )
         lifecycle = Lifecycle()
         host, port = listener.getsockname()[:2]
         url = f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
@@ -274,7 +297,7 @@ def recorder_of(config: ServeConfig, monitor: Monitor) -> AbstractContextManager
     wanted = config.recording()
     if wanted is None:
         return nullcontext()
-    return Recorder(wanted, ModelReply.of(monitor).model_dump())
+    return Recorder(wanted, ModelReply.of(monitor).model_dump(), asdict(config.filter_config()))
 
 
 def _server(app: Guard, lifecycle: Lifecycle, config: ServeConfig, announcement: str) -> DrainingServer:

@@ -17,7 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from system.compiled import compiled
-from system.point_robot import Robot, Stopping
+from system.point_robot import Robot, State, Stopping, advance, follow, stopping
+
+FloatArray = NDArray[np.float64]
 
 _AT_REST = 0.02
 """Way to the stop point below which the robot counts as at rest [m]: 4 cm/s."""
@@ -35,7 +37,7 @@ def steered(robot: Robot, error: float) -> float:
     return min(max(gain * error / (robot.physics_step * robot.substeps), -1.0), 1.0)
 
 
-def braking(robot: np.void, speed: NDArray[np.float64]) -> NDArray[np.float64]:
+def braking(robot: np.void, speed: FloatArray) -> FloatArray:
     """Actions (n, 2) that take half of the speeds ahead (n,) [m/s] within a step, or what thrust can.
 
     Args:
@@ -77,3 +79,21 @@ def law(robot: Robot, kind: int, at: Stopping) -> tuple[float, float]:
     turn = steered(robot, error)
     reach = robot.gear * robot.force_limit / robot.drag * robot.physics_step * robot.substeps
     return fade * min(max(-_SHARE * ahead / reach, -1.0), 1.0), fade * turn
+
+
+@compiled
+def write_plan(
+    robot: Robot, state: State, u1: float, u2: float, backup: int, steps: int, plan: FloatArray
+) -> None:
+    """Write down, action by action, a backup of so many steps from where an action leads.
+
+    ``plan`` (PLAN_STEPS, 2) receives it, and zeros behind it.
+    """
+    plan[:] = 0.0
+    if steps > 0:
+        at = stopping(robot, advance(robot, state, u1, u2, robot.substeps))
+        for step in range(steps):
+            thrust, turn = law(robot, backup, at)
+            at = follow(robot, at, thrust, turn)
+            plan[step, 0] = thrust * robot.force_limit
+            plan[step, 1] = turn

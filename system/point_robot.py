@@ -9,11 +9,14 @@ along x.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from system.compiled import compiled
+
+FloatArray = NDArray[np.floating[Any]]
 
 
 class Robot(NamedTuple):
@@ -140,6 +143,14 @@ def advance(robot: Robot, state: State, thrust: float, turn: float, substeps: in
         y += h * vy
         heading += h * yaw_rate
     return State(x, y, heading, vx, vy, yaw_rate)
+
+
+@compiled
+def once_arrived(robot: Robot, state: State, sent: FloatArray, steps: int) -> State:
+    """The state once the last ``steps`` actions of ``sent`` (n, 2), the newest first, have taken effect."""
+    for step in range(steps - 1, -1, -1):
+        state = advance(robot, state, sent[step, 0], sent[step, 1], robot.substeps)
+    return state
 
 
 @compiled

@@ -23,7 +23,9 @@ MAY_IMPORT: dict[str, set[str]] = {
     "trainer": {"command", "pointgoal", "models", "decision", "system", "filter", "guide"},
     "monitor": {"decision", "system", "filter", "guide", "models", "pointgoal.observation"},
     "recorder": set(),
-    "server": {"command", "decision", "monitor", "models", "guide", "recorder", "pointgoal.observation"},
+    "server": {
+        *("command", "decision", "monitor", "models", "filter", "guide", "recorder", "pointgoal.observation"),
+    },
     "evaluation": {
         *(
             "command",

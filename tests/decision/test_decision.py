@@ -118,7 +118,8 @@ for name in ("numba", "scipy", "onnxruntime", "onnx", "pydantic", "fastapi", "os
              "mujoco", "gymnasium"):
     sys.modules[name] = None
 import decision
-decision.next_of_plan(decision.memory_from_json({"side": 0, "guided": 0, "open": 0, "plan": [[0.0, 1.0]]}))
+memory = decision.memory_to_json(decision.memory_of(1, None)[0]) | {"plan": [[0.0, 1.0]]}
+decision.next_of_plan(decision.memory_from_json(memory))
 rooms = {"system", "filter", "guide", "monitor", "models", "server", "trainer", "evaluation", "pointgoal"}
 assert not rooms & set(sys.modules)
 foreign = {name.split(".")[0] for name in sys.modules} - set(sys.stdlib_module_names) - {"decision", "numpy"}

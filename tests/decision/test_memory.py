@@ -9,7 +9,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from decision import MEMORY, MOST_OPEN, PLAN_STEPS, memory_from_json, memory_to_json, next_of_plan
+from decision import (
+    MEMORY,
+    MOST_LATE,
+    MOST_OPEN,
+    PLAN_STEPS,
+    SENSED,
+    fall_back,
+    memory_from_json,
+    memory_to_json,
+    next_of_plan,
+)
 
 controls = st.floats(-1.0, 1.0)
 
@@ -23,6 +33,10 @@ def memories(draw: st.DrawFn) -> np.ndarray:
     memory["open"] = draw(st.integers(0, MOST_OPEN))
     memory["planned"], memory["left"] = draw(st.booleans()) or bool(plan), len(plan)
     memory["plan"][0, : len(plan)] = np.array(plan).reshape(-1, 2)
+    rng = np.random.default_rng(draw(st.integers(0, 2**32)))
+    history = memory["history"]
+    history["sent"], history["sensed"] = rng.uniform(-1, 1, (MOST_LATE + 1, 2)), rng.normal(size=SENSED)
+    history["age"] = draw(st.integers(0, 10))
     return memory
 
 
@@ -40,12 +54,19 @@ def good() -> dict:
     return memory_to_json(memory[0])
 
 
+def history(**changes: float) -> str:
+    memory = np.zeros(1, MEMORY)
+    for name, value in changes.items():
+        memory["history"][name] = value
+    return memory_to_json(memory[0])["history"]
+
+
 @pytest.mark.parametrize(
     ("change", "named"),
     [
         (lambda m: m.clear(), "memory has the fields"),
         (lambda m: m.update(extra=[0]), "extra"),
-        (lambda m: m.pop("side"), "expected guided, open, plan, side"),
+        (lambda m: m.pop("side"), "expected guided, history, open, plan, side"),
         (lambda m: m.update(side=[]), r"memory\.side"),
         (lambda m: m.update(side=0.5), r"memory\.side"),
         (lambda m: m.update(side=1e300), r"memory\.side"),
@@ -60,6 +81,14 @@ def good() -> dict:
         (lambda m: m.update(open=-1), r"memory\.open"),
         (lambda m: m.update(open=MOST_OPEN + 1), r"memory\.open"),
         (lambda m: m.update(open=False), r"memory\.open"),
+        (lambda m: m.update(history=None), r"memory\.history"),
+        (lambda m: m.update(history="fast"), r"memory\.history"),
+        (lambda m: m.update(history="\u00e4" * 400), r"memory\.history"),
+        (lambda m: m.update(history=history(age=1)[:-4]), r"memory\.history"),
+        (lambda m: m.update(history=history(sent=1.5)), r"memory\.history"),
+        (lambda m: m.update(history=history(sent=np.nan)), r"memory\.history"),
+        (lambda m: m.update(history=history(sensed=np.inf)), r"memory\.history"),
+        (lambda m: m.update(history=history(age=-1)), r"memory\.history"),
         (lambda m: m.update(plan="fast"), r"memory\.plan"),
         (lambda m: m.update(plan=[1.0]), r"memory\.plan"),
         (lambda m: m.update(plan=[[1.0, 0.0, 0.0]]), r"memory\.plan"),
@@ -102,3 +131,14 @@ def test_each_robot_plays_its_own_plan() -> None:
     action, after = next_of_plan(memory)
     np.testing.assert_array_equal(action, [[0.0, 0.0], [0.03, 0.03], [0.03, 0.03]])
     assert after["left"].tolist() == [0, 0, 19]
+
+
+def test_what_a_fallback_sends_is_under_way_as_well() -> None:
+    memory = np.zeros(2, MEMORY)
+    memory["plan"][0, :2], memory["left"][0], memory["planned"][0] = [[0.05, 1.0], [0.04, 0.5]], 2, True
+    memory["history"]["age"] = [3, 0]
+    for _ in range(2):
+        memory = fall_back(memory, "why").memory
+    assert np.allclose(memory["history"]["sent"][0, :3], [[0.04, 0.5], [0.05, 1.0], [0.0, 0.0]])
+    assert (memory["history"]["sent"][1] == 0.0).all()
+    assert memory["history"]["age"].tolist() == [5, 0]

@@ -55,7 +55,7 @@ class ScriptedFilter(BarrierFilter):
         self.spoilt: float | None = None
         self.changes = changes
 
-    def look(self, observation, hazards=None):
+    def look(self, observation, hazards=None, memory=None):
         self._raise("look", np.asarray(observation)[:, 3])
         return super().look(observation, hazards)
 

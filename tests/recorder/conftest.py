@@ -74,4 +74,8 @@ def scribe() -> Scribe:
 def about() -> dict[str, Any]:
     """What decided, as the service tells it."""
     model = {"model": "tiny@0", "gate": "risk", "observation_layout": LAYOUT}
-    return {"version": "0", "text": {"version": "0", "model": json.dumps(model)}, "layout": LAYOUT}
+    return {
+        "version": "0",
+        "text": {"version": "0", "model": json.dumps(model), "filter": "{}"},
+        "layout": LAYOUT,
+    }

@@ -283,7 +283,7 @@ def test_whatever_comes_is_decided_or_refused_in_strict_json(
 
 def test_the_memory_of_a_reply_is_taken_back(app, observation) -> None:
     memory = app.post("/act", json={"observation": observation}).json()["memory"]
-    assert set(memory) == {"side", "guided", "open", "plan"}
+    assert set(memory) == {"side", "guided", "open", "history", "plan"}
     assert app.post("/act", json={"observation": observation, "memory": memory}).status_code == 200
 
 

@@ -278,7 +278,7 @@ def test_a_good_reply_is_the_decision(fake, monitor, observation) -> None:
         client.decide(np.array(observation), memory=decision.memory)
     assert "memory" not in asked[0]
     assert asked[0]["hazards"] == [[1.0, 2.0]]
-    assert asked[1]["memory"] == {"side": 3, "guided": 1, "open": 0, "plan": PLAN}
+    assert asked[1]["memory"] == {"side": 3, "guided": 1, "open": 0, "history": "", "plan": PLAN}
     assert asked[0]["observation"] == asked[1]["observation"] == observation
     assert asked[0]["request"] != asked[1]["request"]
 

@@ -8,6 +8,7 @@ import shutil
 import struct
 import sys
 from collections.abc import Callable
+from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,6 +18,7 @@ import pytest
 from fastapi.testclient import TestClient
 
 from decision import memory_to_json
+from filter import FilterConfig
 from monitor import Monitor
 from recorder import Recorder, Settings
 from recorder.channels import Scribe
@@ -59,7 +61,7 @@ def recorded(tmp_path_factory, drive, monitor: Monitor) -> Path:
     """Two robots in the simulation, each asked about alone, and both in a batch; then a fallback."""
     folder = tmp_path_factory.mktemp("tapes")
     wanted = Settings(str(folder), 10**9, 10**8, str(folder), 10**9)
-    with Recorder(wanted, ModelReply.of(monitor).model_dump()) as recorder:
+    with Recorder(wanted, ModelReply.of(monitor).model_dump(), {}) as recorder:
         links = [
             TestClient(create_app(monitor, recorder=recorder), client=(f"robot{k}", 1)) for k in range(3)
         ]
@@ -174,7 +176,7 @@ def write_again(
     with Reader(recorded) as reader:
         model = reader.model
         exchanges = list(reader.exchanges())
-    text = {"version": "0", "model": json.dumps(model)}
+    text = {"version": "0", "model": json.dumps(model), "filter": "{}"}
     about = {"version": "0", "text": text, "layout": model["observation_layout"]}
     tape, scribe = Tape(path, about), Scribe(about["layout"])
     for place, one in enumerate(exchanges):
@@ -256,7 +258,7 @@ def test_a_fault_is_recorded_and_is_an_incident(
     """A decision that could not be told: the robot had status 500, and played its plan."""
     broken = Monitor.load(tiny_bundle, "always")
     wanted = Settings(str(tmp_path), 10**9, 10**8, str(tmp_path), 10**9)
-    with Recorder(wanted, ModelReply.of(broken).model_dump()) as recorder:
+    with Recorder(wanted, ModelReply.of(broken).model_dump(), {}) as recorder:
         app = TestClient(create_app(broken, recorder=recorder))
         memory = memory_to_json(broken.decide(observation).memory)
         body = {"observation": observation, "memory": memory}
@@ -275,9 +277,28 @@ def test_a_fault_is_recorded_and_is_an_incident(
     assert "1 of 2 decisions differ" in result.stdout
 
 
+def test_the_filters_settings_are_those_of_then(
+    replay, tmp_path: Path, tiny_bundle: Path, observation
+) -> None:
+    config = FilterConfig(margin=0.2, delay_steps=2)
+    careful = Monitor.load(tiny_bundle, "always", filter_config=config)
+    wanted = Settings(str(tmp_path), 10**9, 10**8, None, 0)
+    body: dict[str, Any] = {"observation": observation, "hazards": [[0.55, 0.1]]}
+    with Recorder(wanted, ModelReply.of(careful).model_dump(), asdict(config)) as recorder:
+        app = TestClient(create_app(careful, recorder=recorder))
+        replies = []
+        for _ in range(20):
+            replies.append(app.post("/act", json=body).json())
+            body["memory"] = replies[-1]["memory"]
+    usual = Monitor.load(tiny_bundle, "always").decide(observation, body["hazards"])
+    assert replies[0]["barrier"] != usual.barrier
+    result = replay(next(tmp_path.glob("*.mcap")), "--bundle", tiny_bundle)
+    assert "20 of 20 decisions equal bit for bit" in result.stdout
+
+
 def test_an_alarm_has_the_ring_written(tmp_path: Path, monitor: Monitor, observation) -> None:
     wanted = Settings(None, 0, 0, str(tmp_path), 10**9)
-    with Recorder(wanted, ModelReply.of(monitor).model_dump()) as recorder:
+    with Recorder(wanted, ModelReply.of(monitor).model_dump(), {}) as recorder:
         app = TestClient(create_app(monitor, recorder=recorder))
         for _ in range(5):
             app.post("/act", json={"observation": observation})
