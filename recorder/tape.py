@@ -39,6 +39,9 @@ class Tape:
         about: what decided.
         incident: for the file of an incident: why and when.
 
+    Attributes:
+        count: how many exchanges have been written.
+
     Raises:
         OSError: if it cannot be written; it is closed then. So do the methods.
     """
@@ -49,7 +52,7 @@ class Tape:
         _lock(self._stream)
         # A chunk ends where `flush` says, never between an exchange's messages.
         self._writer = Writer(self._stream, chunk_size=1 << 62, compression=CompressionType.ZSTD)
-        self._pending = self._chunks = 0
+        self._pending = self._chunks = self._added = self.count = 0
         self._flushed = time.monotonic()
         try:
             self._writer.start(library=f"lagnet {about['version']}")
@@ -74,6 +77,7 @@ class Tape:
             channel = self._channels[topic]
             self._writer.add_message(channel, exchange.received, data, exchange.sent, number)
             self._pending += len(data) + 64
+        self._added += 1
         if self._pending >= _CHUNK:
             self.flush()
 
@@ -85,7 +89,7 @@ class Tape:
             self.abandon()
             raise
         self._chunks += self._pending > 0
-        self._pending = 0
+        self._pending, self.count = 0, self._added
         self._flushed = time.monotonic()
 
     def flush_if_due(self) -> None:
@@ -104,6 +108,7 @@ class Tape:
         try:
             self._writer.finish()  # type: ignore[no-untyped-call]
             self._stream.flush()
+            self.count = self._added
             if lasting:
                 os.fsync(self._stream.fileno())
         finally:
@@ -161,15 +166,17 @@ class Recording:
         folder: where to.
         about: what decided.
         file_bytes: how large a file may become.
-
-    Attributes:
-        count: how many exchanges were recorded.
     """
 
     def __init__(self, folder: Folder, about: About, file_bytes: int) -> None:
         self._folder, self._about, self._file_bytes = folder, about, file_bytes
         self._tape: Tape | None = None
-        self.count = 0
+        self._count = 0
+
+    @property
+    def count(self) -> int:
+        """How many exchanges have been written."""
+        return self._count + (0 if self._tape is None else self._tape.count)
 
     def add(self, exchange: Exchange, entries: Entries) -> None:
         """Records an exchange.
@@ -185,7 +192,6 @@ class Recording:
         if self._tape is None:
             self._tape = Tape(self._folder.new(max(self._file_bytes, size)), self._about)
         self._tape.add(exchange, entries)
-        self.count += 1
 
     def flush_if_due(self) -> None:
         """Writes what has waited for long enough."""
@@ -195,8 +201,11 @@ class Recording:
     def close(self) -> None:
         """Ends the file."""
         if self._tape is not None:
-            tape, self._tape = self._tape, None
-            tape.close()
+            try:
+                self._tape.close()
+            finally:
+                self._count += self._tape.count
+                self._tape = None
 
 
 def _length(file: Path) -> int:

@@ -208,7 +208,7 @@ def _tell(reader: Reader, timeline: Timeline, console: Console) -> None:
     if reader.incident is not None:
         console.print(f"incident at {_utc(timeline.zero)}, which is 0 s: {reader.incident['reason']}")
     if not reader.ended:
-        console.print("the file breaks off: its writer was stopped in the middle", style="yellow")
+        console.print("the file breaks off: its writer was killed, or still writes it", style="yellow")
     if reader.damaged:
         console.print(f"{reader.damaged} stretches of the file are damaged and left out", style="yellow")
     if reader.missing:
