@@ -18,9 +18,9 @@ from numpy.typing import ArrayLike, NDArray
 from decision import MEMORY, Decisions, Memory, next_of_plan
 from filter import BarrierFilter, FilterConfig, Scene
 from guide import DEFAULT_STRENGTH, Guide
+from inference import Networks
 from models import Bundle
 from monitor import Monitor
-from monitor.networks import Networks
 from pointgoal import seeds
 from pointgoal.loop import drive
 from pointgoal.seeds import Use

@@ -19,9 +19,10 @@ import torch
 import tyro
 from torch import nn
 
+from inference import Networks
+from inference.session import session
 from models import Bundle
 from monitor import Monitor
-from monitor.networks import Networks, session
 from pointgoal import seeds
 from pointgoal.seeds import Use
 from pointgoal.vector import PointGoalVectorEnv

@@ -18,8 +18,8 @@ TextArray = NDArray[np.str_]
 
 @lru_cache(maxsize=64)
 def texts(text: str, n: int) -> TextArray:
-    """The same text n times, wide enough for any of `Mode`, `Origin` and `OpenedBy`; not to be written to."""
-    made = np.full(n, text, dtype="<U11")
+    """The same text n times, not to be written to; wide enough for whatever stands in `Decisions`."""
+    made = np.full(n, text, dtype="<U13")
     made.setflags(write=False)
     return made
 
@@ -75,6 +75,8 @@ class OpenedBy(StrEnum):
     """The risk score is above the threshold, or is no number."""
     BARRIER = "barrier"
     """The barrier is below the floor, and the risk score is not above the threshold."""
+    NOVELTY = "novelty"
+    """A sensor shows what it should not, whatever the risk score says."""
     DWELL = "dwell"
     """It was open and stays so: the risk score has not been low for long enough, or the filter has the robot
     in hand. Where the score is above the threshold that is the cause."""
@@ -104,6 +106,9 @@ class Decision:
         risk: the risk score λ_ξ(s); NaN where the multiplier network gave no number or there is none.
         threshold: the gate `risk` opens where the risk score is above this; NaN without a gate.
         opened_by: why the filter was active; None where the gate was closed.
+        novelty: how far the observation is from what it should be, in parts of what is still let pass: above
+            1 the gate opens, whatever the risk score says; NaN if nobody looked.
+        suspect: the sensor that is the farthest from it, where the novelty is above 1, else None.
         memory: what to pass to the next call for this robot, one of `MEMORY`.
     """
 
@@ -118,6 +123,8 @@ class Decision:
     risk: float
     threshold: float
     opened_by: OpenedBy | None
+    novelty: float
+    suspect: str | None
     memory: np.void
 
     @property
@@ -147,6 +154,8 @@ class Decisions:
         risk: (N,).
         threshold: one for all.
         opened_by: (N,) texts of `OpenedBy`; "" where the gate was closed.
+        novelty: (N,).
+        suspect: (N,) the sensors' names; "" for none.
         memory: (N,) of `MEMORY`.
     """
 
@@ -161,6 +170,8 @@ class Decisions:
     risk: FloatArray
     threshold: float
     opened_by: TextArray
+    novelty: FloatArray
+    suspect: TextArray
     memory: Memory
 
     def __len__(self) -> int:
@@ -181,13 +192,21 @@ class Decisions:
             risk=self.risk.item(index),
             threshold=self.threshold,
             opened_by=_OPENED_BY[self.opened_by.item(index)],
+            novelty=self.novelty.item(index),
+            suspect=self.suspect.item(index) or None,
             memory=self.memory[index],
         )
 
     def told(
-        self, nominal_action: FloatArray, risk: FloatArray, threshold: float, opened_by: TextArray
+        self,
+        nominal_action: FloatArray,
+        risk: FloatArray,
+        threshold: float,
+        opened_by: TextArray,
+        novelty: FloatArray,
+        suspect: TextArray,
     ) -> Decisions:
-        """These decisions, with what the policy asked for and what the gate says."""
+        """These decisions, with what the policy asked for, what the gate says, and what is novel."""
         return Decisions(
             self.action,
             nominal_action,
@@ -200,6 +219,8 @@ class Decisions:
             risk,
             threshold,
             opened_by,
+            novelty,
+            suspect,
             self.memory,
         )
 
@@ -259,5 +280,7 @@ class Decisions:
             risk=np.array([row.risk for row in rows]),
             threshold=rows[0].threshold,
             opened_by=np.array([row.opened_by or "" for row in rows], dtype=np.str_),
+            novelty=np.array([row.novelty for row in rows]),
+            suspect=np.array([row.suspect or "" for row in rows], dtype=np.str_),
             memory=np.array([row.memory for row in rows]),
         )

@@ -39,5 +39,7 @@ def fall_back(
         risk=np.full(count, np.nan),
         threshold=threshold,
         opened_by=np.full(count, OpenedBy.FAULT),
+        novelty=np.full(count, np.nan),
+        suspect=np.full(count, ""),
         memory=after,
     )

@@ -22,7 +22,13 @@ MOST_LATE = 5
 """Control steps by which an action's effect may be late at most, see `filter.FilterConfig.delay_steps`."""
 
 HISTORY = np.dtype(
-    [("sent", "f4", (MOST_LATE + 1, 2)), ("sensed", "f4", (SENSED,)), ("age", "i8")],
+    [
+        ("sent", "f4", (MOST_LATE + 1, 2)),
+        ("sensed", "f4", (SENSED,)),
+        ("age", "i4"),
+        ("doubted", "i2"),
+        ("doubts", "i2"),
+    ],
     align=True,
 )
 """What a robot was sent and what it saw, to compare with what it sees next.
@@ -30,6 +36,8 @@ HISTORY = np.dtype(
 - ``sent``: the last actions, the newest first.
 - ``sensed``: the last observation, as long as it is; zeros behind it.
 - ``age``: for how many control steps it is the last one; 0: there is none.
+- ``doubted``: for how many more control steps a sensor that the filter steers by is not trusted, and
+- ``doubts``: how often that has begun.
 """
 
 _NO_HISTORY = bytes(HISTORY.itemsize)

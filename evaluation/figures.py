@@ -14,8 +14,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from inference import Networks
 from models import Bundle
-from monitor.networks import Networks
 from pointgoal import seeds
 from pointgoal.loop import drive
 from pointgoal.scene import STEP_SECONDS

@@ -9,22 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import TypeVar
 
-from scipy.stats import binom
-
 Candidate = TypeVar("Candidate")
-
-
-def p_value(missed: int, episodes: int, miss_rate: float) -> float:
-    """P(at most so many of the episodes are missed), were the probability of a miss just `miss_rate`."""
-    return float(binom.cdf(missed, episodes, miss_rate))
-
-
-def most_missed(episodes: int, miss_rate: float, confidence: float) -> int:
-    """How many of the episodes may be missed; -1 if not even 0 may: more of them are needed."""
-    allowed = -1
-    while allowed < episodes and p_value(allowed + 1, episodes, miss_rate) <= 1.0 - confidence:
-        allowed += 1
-    return allowed
 
 
 def last_to_pass(candidates: Sequence[Candidate], passes: Callable[[Candidate], bool]) -> Candidate | None:

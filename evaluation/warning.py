@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,9 +15,10 @@ from rich.console import Console
 from rich.table import Table
 
 from command import progress_bar
+from evaluation.errors import CalibrateError
 from filter import BarrierFilter
+from inference import Networks
 from models import Bundle
-from monitor.networks import Networks
 from pointgoal import seeds
 from pointgoal.loop import SIDE_BY_SIDE, drive, groups
 from pointgoal.scene import STEP_SECONDS
@@ -29,6 +31,7 @@ if TYPE_CHECKING:
     from evaluation.calibrate import CalibrateConfig
 
 FloatArray = NDArray[np.float64]
+Critic = Callable[[FloatArray], FloatArray]
 BoolArray = NDArray[np.bool_]
 
 HORIZONS = (0.1, 0.25, 0.5, 1.0, 2.0)
@@ -44,7 +47,15 @@ SCORES = {
     "distance": "distance to the nearest hazard",
     "barrier": "the filter's barrier, from the observation",
 }
-_COLOURS = {"λ": "#7b2cbf", "coasting": "#f48c06", "distance": "#8d99ae", "barrier": "#2a9d8f"}
+CRITIC = "cost critic"
+"""Name and label of the score that a training run adds: what its cost critic expects to follow."""
+_COLOURS = {
+    "λ": "#7b2cbf",
+    "coasting": "#f48c06",
+    "distance": "#8d99ae",
+    "barrier": "#2a9d8f",
+    CRITIC: "#d62828",
+}
 
 
 @dataclass(frozen=True)
@@ -80,11 +91,11 @@ class Quality:
     lead: tuple[float, float, float]
 
 
-def play(bundle: Bundle, episodes: int, seed: int, console: Console) -> Drives:
-    """Drives unfiltered episodes on layouts that nothing was chosen on."""
+def play(bundle: Bundle, episodes: int, seed: int, console: Console, critic: Critic | None = None) -> Drives:
+    """Drives unfiltered episodes on layouts that nothing was chosen on; scored by a cost critic as well."""
     networks, robot_filter = Networks(bundle), BarrierFilter()
     cost = np.zeros((EPISODE_STEPS, episodes))
-    scores = {name: np.zeros_like(cost) for name in SCORES}
+    scores = {name: np.zeros_like(cost) for name in (*SCORES, *(() if critic is None else (CRITIC,)))}
     layouts = seeds.rows(Use.WARNING_REPORT, seed, episodes)
     with progress_bar(console) as bar:
         job = bar.add_task("unfiltered episodes", total=episodes * EPISODE_STEPS)
@@ -100,6 +111,8 @@ def play(bundle: Bundle, episodes: int, seed: int, console: Console) -> Drives:
                 now["distance"] = -np.hypot(hazards[..., 0], hazards[..., 1]).min(axis=1)
                 now["coasting"] = -coasting_clearance(observation[:, 3:5], hazards)
                 now["barrier"] = -robot_filter.look(observation).barrier
+                if critic is not None:
+                    now[CRITIC] = critic(observation)
                 return action
 
             for t, step in enumerate(drive(env, act, layouts[part])):
@@ -109,6 +122,39 @@ def play(bundle: Bundle, episodes: int, seed: int, console: Console) -> Drives:
                 bar.advance(job, len(step.cost))
             env.close()
     return Drives(cost, scores)
+
+
+def cost_critic(folder: Path, bundle: Bundle) -> Critic:
+    """V_c of a training run's last checkpoint: observations (N, O) → discounted cost that it expects (N,).
+
+    Raises:
+        CalibrateError: if the folder holds no checkpoint that can be read, or one of another task than the
+            bundle's.
+    """
+    import torch
+
+    from trainer.errors import TrainerError
+    from trainer.export import TrainedRun
+    from trainer.learner import COST
+    from trainer.train import why_not_exported
+
+    try:
+        run = TrainedRun(folder)
+    except TrainerError as error:
+        raise CalibrateError(f"--run: {error}") from error
+    task = bundle.manifest.task
+    if run.config.task != task:
+        raise CalibrateError(f"--run {folder}: it is of task {run.config.task}, the bundle is of {task}")
+    if why := why_not_exported(run.config):
+        raise CalibrateError(f"--run {folder}: {why}")
+    torch.set_num_threads(1)
+
+    def value(observation: FloatArray) -> FloatArray:
+        inputs = run.learner.inputs(observation.astype(np.float32))
+        with torch.no_grad():
+            return run.learner.values(inputs)[COST].double().numpy()
+
+    return value
 
 
 def coasting_clearance(velocity: FloatArray, hazards: FloatArray) -> FloatArray:
@@ -227,8 +273,9 @@ def report(config: CalibrateConfig, console: Console) -> Table:
     """Measures, writes figures and picture into the folder, and returns the table."""
     assert config.report is not None
     bundle = Bundle.load(config.bundle)
-    drives = play(bundle, config.episodes, config.seed, console)
-    found = {name: judge(drives, name, config.seed) for name in SCORES}
+    critic = None if config.run is None else cost_critic(config.run, bundle)
+    drives = play(bundle, config.episodes, config.seed, console, critic)
+    found = {name: judge(drives, name, config.seed) for name in drives.scores}
     config.report.mkdir(parents=True, exist_ok=True)
     content = {
         "bundle": bundle.id,
@@ -276,7 +323,7 @@ def draw(found: dict[str, Quality], who: str, episodes: int, path: Path) -> None
         for name, quality in found.items():
             value, low, high = np.array(list(getattr(quality, kind).values())).T
             axes.fill_between(HORIZONS, low, high, color=_COLOURS[name], alpha=0.18, lw=0)
-            axes.plot(HORIZONS, value, "o-", ms=4, lw=2, color=_COLOURS[name], label=SCORES[name])
+            axes.plot(HORIZONS, value, "o-", ms=4, lw=2, color=_COLOURS[name], label=SCORES.get(name, name))
         axes.set_xscale("log")
         axes.set_xticks(HORIZONS, [f"{horizon:g}" for horizon in HORIZONS])
         axes.minorticks_off()

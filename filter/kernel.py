@@ -49,8 +49,7 @@ SEEN = np.dtype(
 )
 """One robot when its next action takes effect, as the filter sees it: where that is, from where it was seen
 [m, rad]; its velocity ahead and to the left [m/s], its yaw rate [rad/s]; how many obstacles are within reach;
-its best backup from there, whose clearance is the barrier; and a backup whose clearance is at least 0 after
-what any one action might cost it, if there is one."""
+its best backup from there, whose clearance is the barrier; one that keeps 0 after any one action, if any."""
 COMMITTED, UNKEPT, INSIDE = 0, 1, 2
 """What `recover` finds: a backup that keeps the inner margin; one that does not; a robot inside a hazard."""
 _GRID = 5
@@ -94,9 +93,8 @@ def see(
             if not abs(observation[k, i]) <= _LARGEST:
                 return int(k * observation.shape[1] + i)
         one = seen[k]
-        coming = State(
-            0.0, 0.0, 0.0, observation[k, velocity], observation[k, velocity + 1], observation[k, yaw]
-        )
+        vx, vy = observation[k, velocity], observation[k, velocity + 1]
+        coming = State(0.0, 0.0, 0.0, vx, vy, observation[k, yaw])
         one.x, one.y, one.heading, one.vx, one.vy, one.yaw_rate = coming
         if config.delay_steps > 0:
             coming = once_arrived(config.robot, coming, memory[k].history.sent, config.delay_steps)

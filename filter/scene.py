@@ -12,7 +12,7 @@ from filter.errors import FilterInputError
 from filter.kernel import SEEN, see
 from pointgoal.observation import ObservationLayout, layout
 from system.lidar import CONES
-from system.obstacles import COLUMNS
+from system.obstacles import COLUMNS, FAR
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -56,7 +56,7 @@ class Scene:
         obstacles: (N, M, COLUMNS), from where the next action takes effect; of each robot's, the first
             ``seen["count"]`` count.
         source: (N, M) each one's hazard, or, behind those, its lidar bin.
-        doubted: (N,) whether the hazards' lidar contradicts itself; their barrier is NaN.
+        doubted: (N,) whether a sensor is not to be trusted; their barrier is NaN.
     """
 
     observation: FloatArray
@@ -69,6 +69,13 @@ class Scene:
 
     def __len__(self) -> int:
         return len(self.seen)
+
+    def doubt(self, which: BoolArray) -> None:
+        """Trust nothing of what some robots (N,) see, nor how fast they are: they cannot brake."""
+        self.doubted = self.doubted | which
+        self.seen["now"]["clearance"][which] = np.nan
+        self.seen["sure"]["clearance"][which] = -FAR
+        self.seen["vx"][which] = 0.0
 
     @property
     def readings(self) -> FloatArray:

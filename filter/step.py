@@ -197,5 +197,7 @@ class Step:
             risk=unknown(n),
             threshold=math.nan,
             opened_by=texts(OpenedBy.ALWAYS, n),
+            novelty=unknown(n),
+            suspect=texts("", n),
             memory=memory,
         )

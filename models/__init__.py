@@ -2,13 +2,15 @@
 
 from models.bundle import Bundle, check_target, write_bundle
 from models.errors import BundleError
-from models.manifest import Calibration, Manifest, ObservationBlock
+from models.manifest import MOST_SCORES, Calibration, Manifest, NoveltySource, ObservationBlock
 
 __all__ = [
+    "MOST_SCORES",
     "Bundle",
     "BundleError",
     "Calibration",
     "Manifest",
+    "NoveltySource",
     "ObservationBlock",
     "check_target",
     "write_bundle",

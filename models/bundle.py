@@ -15,7 +15,15 @@ from pydantic import ValidationError
 from models.errors import BundleError
 from models.graph import FLOAT, Graph, Tensor, check_graph, read_graph
 from models.join import join
-from models.manifest import FORMAT_VERSION, MANIFEST_FILE, MULTIPLIER_FILE, NAME, POLICY_FILE, Manifest
+from models.manifest import (
+    FORMAT_VERSION,
+    MANIFEST_FILE,
+    MULTIPLIER_FILE,
+    NAME,
+    NOVELTY_FILE,
+    POLICY_FILE,
+    Manifest,
+)
 
 
 @dataclass(frozen=True)
@@ -29,6 +37,7 @@ class Bundle:
             within bounds.
         multiplier: the bytes of multiplier.onnx: "observation" [batch, O] → "multiplier" [batch], λ_ξ(s) ≥ 0
             (paper eq. 14).
+        novelty: the bytes of novelty.npz, what is normal for the policy on its robot; None: nobody found out.
         id: name and the first 12 digits of the SHA-256 of manifest.json, which covers the graphs' digests.
     """
 
@@ -36,6 +45,7 @@ class Bundle:
     manifest: Manifest
     policy: bytes
     multiplier: bytes
+    novelty: bytes | None
     id: str
 
     @property
@@ -83,11 +93,18 @@ class Bundle:
         multiplier = _read_checked(folder / MULTIPLIER_FILE, manifest)
         _check_graph(folder / POLICY_FILE, policy, manifest, Tensor("action", FLOAT, (None, 2)))
         _check_graph(folder / MULTIPLIER_FILE, multiplier, manifest, Tensor("multiplier", FLOAT, (None,)))
+        novelty = _read_checked(folder / NOVELTY_FILE, manifest) if manifest.novelty else None
         identity = f"{manifest.name}@{hashlib.sha256(text).hexdigest()[:12]}"
-        return Bundle(path=folder, manifest=manifest, policy=policy, multiplier=multiplier, id=identity)
+        return Bundle(folder, manifest, policy, multiplier, novelty, identity)
 
 
-def write_bundle(path: str | Path, policy_onnx: bytes, multiplier_onnx: bytes, manifest: Manifest) -> Bundle:
+def write_bundle(
+    path: str | Path,
+    policy_onnx: bytes,
+    multiplier_onnx: bytes,
+    manifest: Manifest,
+    novelty: bytes | None = None,
+) -> Bundle:
     """Writes a bundle beside its final place, loads it back, and only then renames it into place.
 
     Args:
@@ -96,6 +113,8 @@ def write_bundle(path: str | Path, policy_onnx: bytes, multiplier_onnx: bytes, m
         policy_onnx: the bytes of policy.onnx.
         multiplier_onnx: the bytes of multiplier.onnx.
         manifest: what to write as manifest.json; its sha256 is computed here.
+        novelty: the bytes of novelty.npz, which the manifest then has to say the source of; None: there is
+            none.
 
     Returns:
         The bundle, loaded from its final place.
@@ -106,6 +125,10 @@ def write_bundle(path: str | Path, policy_onnx: bytes, multiplier_onnx: bytes, m
     target = Path(path)
     check_target(target)
     digests = {POLICY_FILE: _digest(policy_onnx), MULTIPLIER_FILE: _digest(multiplier_onnx)}
+    if novelty is not None:
+        digests[NOVELTY_FILE] = _digest(novelty)
+    if (novelty is None) != (manifest.novelty is None):
+        raise BundleError(f"{target}: novelty.npz and the manifest's novelty come together or not at all")
     try:
         complete = Manifest.model_validate(manifest.model_dump() | {"sha256": digests}).to_json()
     except ValidationError as error:
@@ -119,6 +142,8 @@ def write_bundle(path: str | Path, policy_onnx: bytes, multiplier_onnx: bytes, m
             fresh.mkdir()
             (fresh / POLICY_FILE).write_bytes(policy_onnx)
             (fresh / MULTIPLIER_FILE).write_bytes(multiplier_onnx)
+            if novelty is not None:
+                (fresh / NOVELTY_FILE).write_bytes(novelty)
             (fresh / MANIFEST_FILE).write_text(complete, encoding="utf-8")
             _check(fresh, target)
             _move_into_place(fresh, target, aside=temporary / "old")
@@ -147,9 +172,8 @@ def check_target(target: Path) -> None:
         return
     if not (target / MANIFEST_FILE).is_file():
         raise BundleError(f"{target}: exists and is not a bundle; not replaced")
-    foreign = sorted(
-        {entry.name for entry in target.iterdir()} - {MANIFEST_FILE, POLICY_FILE, MULTIPLIER_FILE}
-    )
+    own = {MANIFEST_FILE, POLICY_FILE, MULTIPLIER_FILE, NOVELTY_FILE}
+    foreign = sorted({entry.name for entry in target.iterdir()} - own)
     if foreign:
         raise BundleError(f"{target}: holds {foreign[0]}, which is no part of a bundle; not replaced")
 

@@ -11,7 +11,9 @@ from collections.abc import Iterable
 import onnx
 from onnx import numpy_helper
 
+from models import features
 from models.errors import BundleError
+from models.features import FeatureNumbers
 
 Key = tuple[object, ...]
 
@@ -23,7 +25,8 @@ def join(graphs: Iterable[bytes]) -> bytes:
         graphs: checked ONNX files with the same inputs and opset, and outputs of different names.
 
     Returns:
-        The bytes of a graph that gives each output bit for bit as its own graph does.
+        The bytes of a graph that gives each output bit for bit as its own graph does. If all say the same of
+        their features, so does it.
 
     Raises:
         BundleError: if a graph has graphs or functions of its own, as an export of a feed-forward network
@@ -35,6 +38,7 @@ def join(graphs: Iterable[bytes]) -> bytes:
     joined.graph.name = "joined"
     constants: dict[Key, str] = {}
     nodes: dict[Key, list[str]] = {}
+    told: set[FeatureNumbers | None] = set()
     for k, model in enumerate(models):
         _refuse_nested(model)
         graph = model.graph
@@ -44,9 +48,22 @@ def join(graphs: Iterable[bytes]) -> bytes:
         for node in graph.node:
             _node(joined.graph, node, names, f"{k}.", nodes)
         joined.graph.output.extend(graph.output)
+        told.add(_told(model, names))
     initialised = {tensor.name for tensor in models[0].graph.initializer}
     joined.graph.input.extend(value for value in models[0].graph.input if value.name not in initialised)
+    same = told.pop()
+    if same is not None and not told:
+        features.write(joined, same)
     return bytes(joined.SerializeToString())
+
+
+def _told(model: onnx.ModelProto, names: dict[str, str]) -> FeatureNumbers | None:
+    """What a graph says of its features, by the name that they have in the joined one, if that is sense."""
+    try:
+        told = features.read(model)
+    except BundleError:
+        return None
+    return told and told.model_copy(update={"tensor": names.get(told.tensor, "")})
 
 
 def _refuse_nested(model: onnx.ModelProto) -> None:

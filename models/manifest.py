@@ -11,6 +11,7 @@ FORMAT_VERSION: Literal[1] = 1
 """Version of the bundle format that this code reads and writes."""
 POLICY_FILE = "policy.onnx"
 MULTIPLIER_FILE = "multiplier.onnx"
+NOVELTY_FILE = "novelty.npz"
 MANIFEST_FILE = "manifest.json"
 
 NAME = r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}"
@@ -40,34 +41,87 @@ class ObservationBlock(_Strict):
     unit: str
 
 
+Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+Share = Annotated[float, Field(ge=0.0, le=1.0)]
+
+MOST_SCORES = 200
+"""As many scores of a calibration's episodes are kept at most."""
+_ONLY_IN = {
+    "closed loop": ("violated_without_floor", "hazards", "tried", "seed"),
+    "onset": ("violating", "logs"),
+}
+_MAY_BE_MISSING = {"violated_without_floor"}
+
+
 class Calibration(_Strict):
-    """How the gate was chosen, and what that promises.
+    """How the gate was chosen, and what that promises. What one form alone has, the other leaves out.
 
     Attributes:
         method: "closed loop": of gates in a fixed order, from the most open one on, each was tried on fresh
-            episodes of the loop that is deployed; the last one that passed was taken.
-        miss_rate: α: an episode is missed, in that the barrier had to open the gate before λ did, with at
-            most this probability,
+            episodes of the loop that is deployed; the last one that passed was taken. "onset": by the
+            smallest λ ahead of the violations in a robot's own logs, driven without a filter.
+        miss_rate: α: with at most this probability an episode is missed. Closed loop: the barrier had to open
+            the gate before λ did. Onset: of those with a violation, λ was not above the threshold all through
+            the lead time before each one.
         confidence: with this confidence 1 − δ.
-        episodes: that each gate was tried on.
+        episodes: that each gate was tried on; that the logs hold.
         missed: of those, under the gate that was taken.
-        violated_without_floor: of as many episodes with the barrier's floor off, how many had a violation.
-        hazards: what the filter knew of them.
-        tried: how many gates.
-        seed: of the episodes.
+        violated_without_floor: closed loop: of as many episodes with the barrier's floor off, how many had a
+            violation.
+        scores: of a sample of its episodes, rising, for `lagnet-calibrate --check`: how silent λ was where it
+            had to speak, see `evaluation.exchange`; None: none were kept.
+        violating: onset: episodes with a violation, n.
+        logs: onset: the SHA-256 of each log.
+        hazards: closed loop: what the filter knew of them.
+        tried: closed loop: how many gates.
+        seed: closed loop: of the episodes.
         multiplier: the SHA-256 of the multiplier.onnx that it is for.
     """
 
-    method: Literal["closed loop"]
+    method: Literal["closed loop", "onset"]
     miss_rate: Annotated[float, Field(gt=0.0, lt=1.0)]
     confidence: Annotated[float, Field(gt=0.0, lt=1.0)]
     episodes: Positive
     missed: Annotated[int, Field(ge=0)]
     violated_without_floor: Annotated[int, Field(ge=0)] | None = None
+    scores: Annotated[tuple[Share, ...], Field(min_length=1, max_length=MOST_SCORES)] | None = None
+    violating: Positive | None = None
+    logs: Annotated[tuple[Sha256, ...], Field(min_length=1)] | None = None
+    hazards: Literal["given", "lidar"] | None = None
+    tried: Positive | None = None
+    seed: Annotated[int, Field(ge=0)] | None = None
+    multiplier: Sha256
+
+    @model_validator(mode="after")
+    def _has_what_its_form_has(self) -> Self:
+        for form, names in _ONLY_IN.items():
+            for name in names:
+                there, here = getattr(self, name) is not None, form == self.method
+                if there and not here:
+                    raise ValueError(f"{name}: a calibration of the form {self.method!r} has none")
+                if here and not there and name not in _MAY_BE_MISSING:
+                    raise ValueError(f"{name}: a calibration of the form {self.method!r} needs it")
+        return self
+
+
+class NoveltySource(_Strict):
+    """Where novelty.npz comes from, and what its limits let pass.
+
+    Attributes:
+        episodes: that it was learnt from, in the closed loop, and
+        limit_episodes: others, by which the limits were found: they had no alarm.
+        hours: that these lasted.
+        alarms_per_hour: at most so many false alarms an hour, with 95 % confidence.
+        hazards: what the filter knew of them.
+        seed: of the episodes.
+    """
+
+    episodes: Positive
+    limit_episodes: Positive
+    hours: Annotated[float, Field(gt=0.0)]
+    alarms_per_hour: Annotated[float, Field(gt=0.0)]
     hazards: Literal["given", "lidar"]
-    tried: Positive
     seed: Annotated[int, Field(ge=0)]
-    multiplier: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
 
 class Manifest(_Strict):
@@ -90,6 +144,7 @@ class Manifest(_Strict):
         hysteresis: an open gate stays open while λ is above this share of the threshold.
         dwell: for how many control steps after that it still stays open.
         calibration: how threshold, hysteresis and dwell were chosen; None: they were not.
+        novelty: where novelty.npz comes from; None: there is none.
         hazard_radius: radius of a hazard [m].
         robot: the robot's constants, name → number, as `system.Robot` names them; empty: the task's own.
         opset: version of the standard ONNX operators that both graphs use.
@@ -115,12 +170,11 @@ class Manifest(_Strict):
     hysteresis: Annotated[float, Field(gt=0.0, le=1.0)] = 1.0
     dwell: Annotated[int, Field(ge=0, le=1000)] = 0
     calibration: Calibration | None = None
+    novelty: NoveltySource | None = None
     hazard_radius: Annotated[float, Field(gt=0.0)]
     robot: dict[str, Annotated[int | float, Field(gt=0)]] = {}
     opset: Positive
-    sha256: dict[
-        Literal["policy.onnx", "multiplier.onnx"], Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
-    ] = {}
+    sha256: dict[Literal["policy.onnx", "multiplier.onnx", "novelty.npz"], Sha256] = {}
     training: dict[str, Any] = {}
     figures: dict[str, float] = {}
     versions: dict[str, str] = {}
@@ -157,4 +211,5 @@ class Manifest(_Strict):
 
     def to_json(self) -> str:
         """The text of manifest.json."""
-        return json.dumps(self.model_dump(mode="json"), indent=2, allow_nan=False) + "\n"
+        fields = self.model_dump(mode="json", exclude_none=True)
+        return json.dumps(fields, indent=2, allow_nan=False) + "\n"

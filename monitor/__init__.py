@@ -1,7 +1,8 @@
 """The runtime: policy and multiplier network, the gate, and the decision they end in."""
 
 from guide import DEFAULT_STRENGTH, Strength
-from monitor.errors import MonitorError, NetworkError
+from inference import NetworkError
+from monitor.errors import MonitorError
 from monitor.gate import GATES, Gate, GateName
 from monitor.monitor import Monitor
 

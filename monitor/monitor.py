@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Protocol, cast
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from decision import (
     MEMORY,
@@ -28,10 +28,12 @@ from decision import (
 )
 from filter import DOUBT, BarrierFilter, FilterConfig, FilterInputError, Robot, Scene
 from guide import DEFAULT_STRENGTH, Guide, Strength
+from inference import NetworkError, Networks
+from inference.networks import FloatArray, within
 from models import Bundle
-from monitor.errors import MonitorError, NetworkError
+from monitor.errors import MonitorError
 from monitor.gate import BoolArray, Gate, GateName
-from monitor.networks import FloatArray, Networks, within
+from novelty import Findings, Normal, Watch, nothing
 from pointgoal.observation import layout
 
 
@@ -58,16 +60,17 @@ class Monitor:
         networks: its networks.
         action_filter: the filter.
         gate: when the filter is active: its name, and the bundle says the rest; or all of it.
-        threshold: λ above which the gate `risk` opens; None takes the bundle's.
+        threshold: λ above which the gate `risk` opens; None takes the bundle's, or that of a whole gate.
         guide: how much the filter's guide may do, to be told.
+        watch: looks at what the sensors show; None: nobody does.
 
     Attributes:
         faults: what went wrong so far.
         robot: the constants of the bundle's robot.
 
     Raises:
-        MonitorError: for an unknown gate, a threshold that is not finite and >= 0, or a bundle whose
-            observation layout is not the task's.
+        MonitorError: for an unknown gate, a threshold that is not finite and >= 0 or stands beside a whole
+            gate, or a bundle whose observation layout is not the task's.
     """
 
     def __init__(
@@ -78,6 +81,7 @@ class Monitor:
         gate: GateName | Gate = "risk",
         threshold: float | None = None,
         guide: Strength = "off",
+        watch: Watch | None = None,
     ) -> None:
         _check_layout(bundle)
         manifest = bundle.manifest
@@ -85,18 +89,20 @@ class Monitor:
         self.robot = _robot(bundle)
         self.guide: Strength = guide
         self.faults = Faults()
+        if isinstance(gate, Gate) and threshold is not None:
+            raise MonitorError(f"threshold must be None beside a Gate, which has its own, got {threshold}")
         wanted = manifest.threshold if threshold is None else float(threshold)
-        own = Gate(gate, wanted, manifest.hysteresis, manifest.dwell) if isinstance(gate, str) else gate
-        self.gate: Gate = own
+        self.gate = Gate(gate, wanted, manifest.hysteresis, manifest.dwell) if isinstance(gate, str) else gate
         self._networks = networks
         self._filter = action_filter
+        self._watch = watch
         self._low = np.array(manifest.action_low, np.float64)
         self._high = np.array(manifest.action_high, np.float64)
         self._safe = np.clip(np.array(SAFE_ACTION, np.float64), self._low, self._high)
 
     @staticmethod
     def load(
-        path: str | Path,
+        path: str | Path | Bundle,
         gate: GateName | Gate = "risk",
         threshold: float | None = None,
         filter_config: FilterConfig | None = None,
@@ -105,9 +111,9 @@ class Monitor:
         """Loads a bundle and runs a few decisions, so that the first real one is not the slow one.
 
         Args:
-            path: the bundle's folder.
+            path: the bundle's folder, or a bundle that is loaded.
             gate: when the filter is active: its name, and the bundle says the rest; or all of it.
-            threshold: λ above which the gate `risk` opens; None takes the bundle's.
+            threshold: λ above which the gate `risk` opens; None takes the bundle's, or that of a whole gate.
             filter_config: the filter's settings; None takes the defaults. The hazards' radius and the robot's
                 constants are the bundle's where the settings leave them open.
             guide: how much the guide may do: off, from a refusal on, or ahead.
@@ -116,16 +122,17 @@ class Monitor:
             BundleError: if the bundle must not be used.
             MonitorError: as the constructor, if the settings contradict the bundle, or it cannot decide.
         """
-        bundle = Bundle.load(path)
+        bundle = path if isinstance(path, Bundle) else Bundle.load(path)
         try:
             config = _filter_config(bundle, filter_config or FilterConfig())
             action_filter = BarrierFilter(config, Guide(config, guide))
             networks = Networks(bundle)
+            watch = _watch(bundle, config)
         except (NetworkError, ValueError) as error:
             raise MonitorError(f"{bundle.path}: {error}") from error
-        monitor = Monitor(bundle, networks, action_filter, gate, threshold, guide)
-        monitor._warm_up()
-        return monitor
+        # What a robot at rest nowhere in particular sees is novel: nobody watches that.
+        Monitor(bundle, networks, action_filter, gate, threshold, guide)._warm_up()
+        return Monitor(bundle, networks, action_filter, gate, threshold, guide, watch)
 
     def decide(
         self, observation: ArrayLike, hazards: ArrayLike | None = None, memory: Memory | np.void | None = None
@@ -199,15 +206,16 @@ class Monitor:
         if observation.shape[1:] != (size,):
             raise FilterInputError("observation", f"must have {size} numbers, got {observation.shape[1:]}")
         scene = self._filter.look(observation, hazards, memory)
+        found = self._watch.look(observation, memory) if self._watch is not None else nothing(len(scene))
+        if found.any and self.gate.name != "off":
+            scene.doubt(found.doubted)
         nominal, risk = self._networks.run(observation)
         if nominal.shape != (len(observation), 2) or risk.shape != nominal.shape[:1]:
             raise NetworkError(f"the networks gave shapes {nominal.shape} and {risk.shape}")
         sound = np.empty(len(risk), np.bool_)
         all_sound = within(nominal, self._low, self._high, risk, sound) and lost is None
-        opened_by = self.gate.opened_by(risk, scene.low, memory)
-        if scene.doubted.any() and self.gate.name != "off":
-            opened_by = np.where(scene.doubted, texts(OpenedBy.FAULT, len(scene)), opened_by)
-            self.faults.note("lidar", DOUBT)
+        engaging = scene.low | (found.novelty > 1.0) if found.any else scene.low
+        opened_by = self._opened_by(scene, found, risk, engaging, memory)
         asked = nominal
         if not all_sound:
             sound &= lost is None
@@ -220,12 +228,36 @@ class Monitor:
         decided = self._filter.decide(scene, asked, memory, active)
         if decided.action is not asked or decided.mode.shape != active.shape:
             decided.check(asked, active, self._low, self._high)
+        if found.any and self.gate.name != "off":
+            decided = _say_why(decided, found)
         if not all_sound:
             decided = self._planned(
                 decided, [lost or self._wrong(*row) for row in zip(nominal, risk, sound, strict=True)]
             )
-        self.gate.remember(risk, scene.low, decided.mode != Mode.NOMINAL, decided.memory)
-        return decided.told(nominal, risk, self.gate.threshold, opened_by)
+        self.gate.remember(risk, engaging, decided.mode != Mode.NOMINAL, decided.memory)
+        if self._watch is not None:
+            self._watch.remember(observation, found, decided.memory)
+        return decided.told(nominal, risk, self.gate.threshold, opened_by, found.novelty, found.suspect)
+
+    def _opened_by(
+        self, scene: Scene, found: Findings, risk: FloatArray, engaging: BoolArray, memory: Memory
+    ) -> NDArray[np.str_]:
+        """What opens the gate for N robots: its own causes, and those of doubt, which are noted."""
+        opened_by = self.gate.opened_by(risk, engaging, memory)
+        if found.any:
+            for sensor in np.unique(found.suspect[found.suspect != ""]).tolist():
+                self.faults.note(f"novelty: {sensor}", f"the {sensor} shows what it should not")
+        if self.gate.name == "off":
+            return opened_by
+        if found.any:
+            novel = found.doubted | (found.novelty > 1.0)
+            opened_by = np.where(novel, texts(OpenedBy.NOVELTY, len(scene)), opened_by)
+        if scene.doubted.any():
+            by_scan = scene.doubted & ~found.doubted
+            opened_by = np.where(by_scan, texts(OpenedBy.FAULT, len(scene)), opened_by)
+            if by_scan.any():
+                self.faults.note("lidar", DOUBT)
+        return opened_by
 
     def _wrong(self, nominal: FloatArray, risk: float, sound: np.bool_) -> str | None:
         """What is wrong with what the networks gave for a robot, noted; None if nothing is."""
@@ -276,6 +308,26 @@ class Monitor:
             scene = self._filter.look(at_rest, np.array([[[distance, 0.03]]]))
             self._filter.decide(scene, asked, np.zeros(1, MEMORY), np.ones(1, np.bool_))
             self.decide(at_rest[0], [[distance, 0.03]])
+
+
+def _say_why(decided: Decisions, found: Findings) -> Decisions:
+    """Names the sensor in the reasons of robots that stop because of it."""
+    reason = list(decided.reason)
+    for k in found.doubted.nonzero()[0]:
+        who = f"the {found.suspect[k]} shows" if found.suspect[k] else "a sensor showed"
+        reason[k] = (reason[k] or "").replace(DOUBT, f"{who} what it should not")
+    return replace(decided, reason=reason)
+
+
+def _watch(bundle: Bundle, config: FilterConfig) -> Watch | None:
+    """Who looks at the sensors; None if the bundle does not say what is normal."""
+    if bundle.novelty is None:
+        return None
+    normal = Normal.from_bytes(bundle.novelty, bundle.manifest.observation_size)
+    watch = Watch(normal, config.robot or _robot(bundle), config.delay_steps)
+    nobody, memory = np.zeros((1, bundle.manifest.observation_size)), np.zeros(1, MEMORY)
+    watch.remember(nobody, watch.look(nobody, memory), memory)
+    return watch
 
 
 def _robot(bundle: Bundle) -> Robot:

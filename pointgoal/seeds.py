@@ -39,11 +39,18 @@ class Use(IntEnum):
     WARNING = 9
     """The drives on which λ is fitted to warn; the rest: disturbances, weights, minibatches."""
     GATE = 10
-    """`lagnet-calibrate`: the closed loops by which a gate is chosen."""
+    """`lagnet-calibrate`: the closed loops by which a gate is chosen; the rest: the states on which
+    decisions are timed, and of which episodes of a log the scores are kept."""
     WARNING_REPORT = 11
     """`lagnet-calibrate --report`: how well λ warns."""
     NETWORK_SPEED = 12
     """`benchmarks.networks`: the states that it runs on."""
+    EXCHANGE = 13
+    """The rest alone: how `lagnet-calibrate --check` orders equal scores."""
+    NOVELTY = 14
+    """`lagnet-calibrate --novelty`: what a policy's own drives look like."""
+    SENSORS = 15
+    """`benchmarks.sensors`; the rest: which sensor fails when, and how."""
 
 
 def rows(use: Use, seed: int, count: int) -> list[int]:

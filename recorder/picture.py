@@ -17,20 +17,23 @@ FloatArray = NDArray[np.float64]
 
 _INK, _GREY, _PANEL, _UNSAFE = "#1b263b", "#8d99ae", "#f7f8fa", "#f6bdc0"
 _RISK, _BARRIER, _THRUST, _TURN = "#7b2cbf", "#0077b6", "#d62839", "#2a9d8f"
-_MODES = {
+MODES = {
     "nominal": "#cfe8e4",
     "guided": "#4cc9f0",
     "filtered": "#f48c06",
     "fallback": "#1b263b",
     FAULT: "#d00000",
 }
-_CAUSES = {
+"""Colours of what became of the nominal action."""
+CAUSES = {
     "risk": "#7b2cbf",
     "dwell": "#cdb4e6",
     "barrier": "#70a80b",
     "always": "#0077b6",
+    "novelty": "#e85d9f",
     "fault": "#000000",
 }
+"""Colours of what opened the gate."""
 _PAUSE = 0.5
 """A longer silence is not drawn through [s]."""
 
@@ -109,7 +112,7 @@ def _draw_ribbons(axes: Axes, seconds: FloatArray, rows: list[Row]) -> None:
     ends = np.append(seconds[1:], seconds[-1] + 0.02)
     ends = np.minimum(ends, seconds + _PAUSE)
     patches = []
-    lanes = ((1.0, [row.mode for row in rows], _MODES), (0.0, [row.opened_by for row in rows], _CAUSES))
+    lanes = ((1.0, [row.mode for row in rows], MODES), (0.0, [row.opened_by for row in rows], CAUSES))
     for lane, texts, colours in lanes:
         for text, colour in colours.items():
             spans = [(seconds[k], ends[k] - seconds[k]) for k, it in enumerate(texts) if it == text]

@@ -14,7 +14,7 @@ import numba
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
-_ROOMS = ("decision", "system", "filter", "guide", "monitor")
+_ROOMS = ("decision", "system", "filter", "guide", "inference", "novelty", "monitor")
 """The rooms that hold compiled code, and what goes into it."""
 
 

@@ -20,8 +20,12 @@ MAY_IMPORT: dict[str, set[str]] = {
     "system": {"decision", "pointgoal.observation"},
     "filter": {"decision", "system", "pointgoal.observation"},
     "guide": {"decision", "system", "filter", "pointgoal.observation"},
+    "inference": {"models", "system.compiled", "pointgoal.observation"},
     "trainer": {"command", "pointgoal", "models", "decision", "system", "filter", "guide"},
-    "monitor": {"decision", "system", "filter", "guide", "models", "pointgoal.observation"},
+    "novelty": {"decision", "system", "pointgoal.observation"},
+    "monitor": {
+        *("decision", "system", "filter", "guide", "inference", "novelty", "models", "pointgoal.observation"),
+    },
     "recorder": set(),
     "server": {
         *("command", "decision", "monitor", "models", "filter", "guide", "recorder", "pointgoal.observation"),
@@ -35,6 +39,8 @@ MAY_IMPORT: dict[str, set[str]] = {
             "system",
             "filter",
             "guide",
+            "inference",
+            "novelty",
             "trainer",
             "monitor",
             "recorder",
@@ -46,7 +52,10 @@ MOST_LINES = {"filter": 2000, "monitor": 500}
 """The project's own bounds: what no longer fits does a second job."""
 MOST_LINES_OF_THE_FILTERS_CLASS = 150
 HEAVY = {"torch", "mujoco", "gymnasium", "matplotlib", "PIL", "scipy", "ray", "tensorboard"}
-RUNTIME = ("command", "models", "decision", "system", "filter", "guide", "monitor", "recorder", "server")
+RUNTIME = (
+    *("command", "models", "decision", "system", "filter", "guide", "inference", "novelty", "monitor"),
+    *("recorder", "server"),
+)
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 SCRIPTS = PROJECT["project"]["scripts"]
 

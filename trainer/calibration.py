@@ -1,4 +1,4 @@
-"""The threshold on λ above which the gate opens, from closed-loop episodes.
+"""The threshold on λ above which the gate opens, from recorded episodes without a filter: the onset form.
 
 Whole episodes are scored, not steps, for the steps of an episode are not exchangeable. The score S of an
 episode with violations is the smallest λ in the lead time before each of them begins: a threshold below S
@@ -11,19 +11,19 @@ nothing of the closed loop with the filter in it: `lagnet-evaluate --gate risk` 
 """
 
 from dataclasses import dataclass
-from math import comb
 
 import numpy as np
 import numpy.typing as npt
 
 from pointgoal.scene import STEP_SECONDS
+from trainer.binomial import least_episodes, most_missed
 
 LEAD = 0.6
 """Lead time the filter needs [s]: to turn, and to stop from top speed."""
-MISS = 0.05
+MISS_RATE = 0.05
 """α: largest share of violating episodes that the gate may open too late for."""
-DOUBT = 0.05
-"""δ: largest probability that the calibration itself is wrong about that."""
+CONFIDENCE = 0.95
+"""1 − δ: how sure that has to be."""
 
 
 @dataclass(frozen=True)
@@ -31,12 +31,21 @@ class Threshold:
     """A threshold and how it came about.
 
     Attributes:
-        value: the gate opens where λ is above this.
+        value: the gate opens where λ is above this; 0, which leaves it open, where nothing can be promised.
         source: one sentence for the manifest.
+        scores: S of the violating episodes [n], in their order.
+        why_not: why nothing can be promised; None: it can.
     """
 
     value: float
     source: str
+    scores: npt.NDArray[np.float64]
+    why_not: str | None = None
+
+    @property
+    def missed(self) -> int:
+        """How many of the violating episodes the gate opens too late for."""
+        return int((self.scores <= self.value).sum())
 
 
 def scores(multiplier: npt.NDArray[np.floating], cost: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
@@ -60,44 +69,42 @@ def scores(multiplier: npt.NDArray[np.floating], cost: npt.NDArray[np.floating])
     return np.asarray(found, np.float64)
 
 
-def rank(n: int, miss: float = MISS, doubt: float = DOUBT) -> int:
-    """The largest k with BinomCDF(k − 1; n, miss) ≤ doubt; 0 if there is none."""
-    tail, k = 0.0, 0
-    while k < n:
-        tail += comb(n, k) * miss**k * (1 - miss) ** (n - k)
-        if tail > doubt:
-            break
-        k += 1
-    return k
+def rank(n: int, miss_rate: float = MISS_RATE, confidence: float = CONFIDENCE) -> int:
+    """The largest k with BinomCDF(k − 1; n, α) ≤ δ; 0 if there is none."""
+    return most_missed(n, miss_rate, confidence) + 1
 
 
-def calibrate(multiplier: npt.NDArray[np.floating], cost: npt.NDArray[np.floating]) -> Threshold:
+def calibrate(
+    multiplier: npt.NDArray[np.floating],
+    cost: npt.NDArray[np.floating],
+    miss_rate: float = MISS_RATE,
+    confidence: float = CONFIDENCE,
+) -> Threshold:
     """The threshold that the module describes, or 0, which leaves the gate open, if it cannot be promised.
 
     Args:
         multiplier: λ before each step [T, E].
-        cost: of each step [T, E].
+        cost: of each step [T, E]; NaN after an episode's end.
+        miss_rate: α.
+        confidence: 1 − δ.
 
     Returns:
         The threshold, just below S_(k), so that an episode that scores S_(k) itself is caught.
     """
-    found = np.sort(scores(multiplier, cost))
+    found = scores(multiplier, cost)
     n = found.size
-    k = rank(n)
-    if k == 0:
-        needed = next(m for m in range(1, 10_000) if rank(m))
-        return Threshold(
-            0.0,
-            f"gate always open: {n} of {cost.shape[1]} calibration episodes had a violation, "
-            f"{needed} are needed",
-        )
-    value = float(np.nextafter(np.float32(found[k - 1]), np.float32(0)))
-    if not np.isfinite(value) or value <= 0:
-        return Threshold(
-            0.0, f"gate always open: λ was not above 0 for {LEAD} s ahead in {k} of {n} violating episodes"
-        )
+    k = rank(n, miss_rate, confidence)
+    value = float(np.nextafter(np.float32(np.sort(found)[k - 1]), np.float32(0))) if k else 0.0
+    if value <= 0.0:
+        why = f"λ was not above 0 for {LEAD} s ahead in {k} of {n} violating episodes"
+        if k == 0:
+            needed = least_episodes(miss_rate, confidence)
+            why = f"{n} of {cost.shape[1]} calibration episodes had a violation, {needed} are needed"
+        return Threshold(0.0, f"gate always open: {why}", found, why)
     return Threshold(
         value,
-        f"exact binomial: open for {LEAD} s ahead of every violation in all but {MISS:.0%} of violating "
-        f"episodes, confidence {1 - DOUBT:.0%}, from {n} violating of {cost.shape[1]} episodes (rank {k})",
+        f"exact binomial: open for {LEAD} s ahead of every violation in all but {100 * miss_rate:.4g}% of "
+        f"violating episodes, confidence {100 * confidence:.4g}%, from {n} violating of {cost.shape[1]} "
+        f"episodes (rank {k})",
+        found,
     )

@@ -333,7 +333,8 @@ def _fit(run: TrainedRun, level: int, episodes: int, console: Console) -> _Fitte
 
 def _threshold(run: TrainedRun, played: Episodes) -> Threshold:
     if run.multiplier is None:
-        return Threshold(0.0, f"gate always open: {run.config.algorithm} has no multiplier network")
+        why = f"{run.config.algorithm} has no multiplier network"
+        return Threshold(0.0, f"gate always open: {why}", np.empty(0), why)
     multiplier = np.stack([run.multipliers(row) for row in np.nan_to_num(played.observation)])
     return calibrate(multiplier, played.cost)
 

@@ -8,12 +8,17 @@ import onnx
 import torch
 from torch import Tensor, nn
 
+from models import features as described
+from models.features import FeatureNumbers
 from trainer.actions import ActionRange
-from trainer.features import Features
+from trainer.features import COASTING, GAIN, SHARPNESS, Features
 from trainer.networks import Shape, mlp
+from trainer.normaliser import CLIP
 
 OPSET = 20
 """What the exporter writes without converting."""
+FEATURES = "features"
+"""What a graph calls them."""
 
 
 class Policy(nn.Module):
@@ -75,6 +80,23 @@ def exact(features: Features) -> Features:
     return copy.deepcopy(features).double()
 
 
+class _Showing(nn.Module):
+    """A network that gives its features as well: the tracer names what is given."""
+
+    def __init__(self, network: nn.Module, features: Features) -> None:
+        super().__init__()
+        self.network = network
+        self.features = features
+
+    def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
+        """The network's output and its features [B, m] for raw observations [B, n]."""
+        shown: list[Tensor] = []
+        hook = self.features.register_forward_hook(lambda _, __, features: shown.append(features))
+        output = self.network(observation)
+        hook.remove()
+        return output, shown[0]
+
+
 def graph(network: nn.Module, inputs: int, output: str) -> bytes:
     """Traces a network.
 
@@ -84,16 +106,18 @@ def graph(network: nn.Module, inputs: int, output: str) -> bytes:
         output: the tensor's name.
 
     Returns:
-        The ONNX file's bytes, checked.
+        The ONNX file's bytes, checked. If the network has features with surroundings, they say so, see
+        `models.features`.
     """
     # It warns of every package it could also convert operators of.
     logging.getLogger("torch.onnx._internal.exporter._registration").setLevel(logging.ERROR)
+    features = _described(network)
     with torch.no_grad():
         program = torch.onnx.export(
-            network.eval(),
+            (_Showing(network, features) if features else network).eval(),
             (torch.zeros(2, inputs),),
             input_names=["observation"],
-            output_names=[output],
+            output_names=[output, FEATURES] if features else [output],
             opset_version=OPSET,
             dynamo=True,
             dynamic_shapes=({0: torch.export.Dim("batch")},),
@@ -102,8 +126,33 @@ def graph(network: nn.Module, inputs: int, output: str) -> bytes:
     assert program is not None
     model = program.model_proto
     _strip(model)
+    if features:
+        del model.graph.output[1:]
+        described.write(model, numbers(features))
     onnx.checker.check_model(model, full_check=True)
     return bytes(model.SerializeToString())
+
+
+def _described(network: nn.Module) -> Features | None:
+    """A network's features, if a graph says of them what they are: those without surroundings cost little."""
+    features = getattr(network, "features", None)
+    return features if isinstance(features, Features) and features.surroundings else None
+
+
+def numbers(features: Features) -> FeatureNumbers:
+    """What a graph says of features with surroundings."""
+    normaliser, surroundings = features.normaliser, features.surroundings
+    assert surroundings is not None
+    return FeatureNumbers(
+        tensor=FEATURES,
+        center=tuple(normaliser.center.tolist()),
+        inverse=tuple(normaliser.inverse.tolist()),
+        limit=CLIP,
+        gain=GAIN,
+        length=surroundings.length,
+        coasting=COASTING,
+        sharpness=SHARPNESS,
+    )
 
 
 def _strip(model: onnx.ModelProto) -> None:

@@ -35,6 +35,8 @@ def batch() -> Decisions:
         risk=rng.random(N),
         threshold=0.5,
         opened_by=np.array(["", *OpenedBy, "", ""][:N], dtype=np.str_),
+        novelty=rng.random(N),
+        suspect=np.array(["gyro", "", "hazards_lidar", *[""] * N][:N], dtype=np.str_),
         memory=memory,
     )
 
@@ -85,7 +87,8 @@ def test_parts_make_the_batch_again(batch, cuts) -> None:
     for field in fields(Decisions):
         a, b = getattr(batch, field.name), getattr(again, field.name)
         # Texts are as wide as the widest of their part.
-        assert a.tolist() == b.tolist() if field.name in ("mode", "origin", "opened_by") else same(a, b)
+        words = field.name in ("mode", "origin", "opened_by", "suspect")
+        assert a.tolist() == b.tolist() if words else same(a, b)
 
 
 def test_texts_are_wide_enough_for_every_name_and_not_to_be_written_to() -> None:
@@ -98,9 +101,10 @@ def test_texts_are_wide_enough_for_every_name_and_not_to_be_written_to() -> None
 
 
 def test_what_is_told_of_policy_and_gate_changes_nothing_else(batch) -> None:
-    told = batch.told(np.zeros((N, 2)), np.ones(N), 0.25, texts(OpenedBy.RISK, N))
+    said = texts(OpenedBy.RISK, N), np.zeros(N), texts("", N)
+    told = batch.told(np.zeros((N, 2)), np.ones(N), 0.25, *said)
     assert told.threshold == 0.25
-    changed = {"nominal_action", "risk", "threshold", "opened_by"}
+    changed = {"nominal_action", "risk", "threshold", "opened_by", "novelty", "suspect"}
     for field in fields(Decisions):
         same_one = getattr(told, field.name) is getattr(batch, field.name)
         assert same_one != (field.name in changed), field.name
@@ -109,7 +113,7 @@ def test_what_is_told_of_policy_and_gate_changes_nothing_else(batch) -> None:
 def test_the_names_are_texts_for_users() -> None:
     assert [*Mode] == ["nominal", "guided", "filtered", "fallback"]
     assert [*Origin] == ["barrier", "circulation", "search", "plan", "least harm", "guide"]
-    assert [*OpenedBy] == ["always", "risk", "barrier", "dwell", "fault"]
+    assert [*OpenedBy] == ["always", "risk", "barrier", "novelty", "dwell", "fault"]
 
 
 SCRIPT = """
@@ -120,7 +124,8 @@ for name in ("numba", "scipy", "onnxruntime", "onnx", "pydantic", "fastapi", "os
 import decision
 memory = decision.memory_to_json(decision.memory_of(1, None)[0]) | {"plan": [[0.0, 1.0]]}
 decision.next_of_plan(decision.memory_from_json(memory))
-rooms = {"system", "filter", "guide", "monitor", "models", "server", "trainer", "evaluation", "pointgoal"}
+rooms = {"system", "filter", "guide", "inference", "novelty", "monitor", "models", "server"}
+rooms |= {"trainer", "evaluation", "pointgoal"}
 assert not rooms & set(sys.modules)
 foreign = {name.split(".")[0] for name in sys.modules} - set(sys.stdlib_module_names) - {"decision", "numpy"}
 print(sorted(name for name in foreign if not name.startswith("_") and "." not in name))

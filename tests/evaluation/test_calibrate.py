@@ -6,24 +6,32 @@ import json
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import onnx
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from rich.console import Console
-from scipy.stats import mannwhitneyu
+from scipy.stats import binom, mannwhitneyu
 
 from evaluation import warning
 from evaluation.calibrate import CalibrateConfig, Tried, calibrate
 from evaluation.errors import CalibrateError
-from evaluation.sequence import last_to_pass, most_missed, p_value
+from evaluation.sequence import last_to_pass
 from evaluation.warning import Drives, coasting_clearance, false_alarms, judge, labels, lead, onsets
 from models import Bundle, BundleError, write_bundle
 from monitor import Monitor
+from pointgoal.vector import PointGoalVectorEnv
+from trainer import checkpoint
+from trainer.binomial import most_missed, p_value
+from trainer.config import Config
+from trainer.features import Features, surroundings
+from trainer.train import train
 
 QUIET = Console(quiet=True)
 
@@ -36,8 +44,7 @@ def test_the_promise_fails_no_more_often_than_it_says(rates) -> None:
     allowed = most_missed(episodes, miss_rate, confidence)
     chosen = [last_to_pass(rates, lambda rate: rng.binomial(episodes, rate) <= allowed) for _ in range(1000)]
     broken = sum(rate is not None and rate > miss_rate for rate in chosen)
-    # 100 are expected at most; five standard deviations more would be a defect.
-    assert broken <= 100 + 5 * np.sqrt(90)
+    assert broken <= binom.ppf(1 - 1e-4, 1000, 1.0 - confidence)
     if rates[0] > miss_rate:
         assert broken > 50
     else:
@@ -62,10 +69,10 @@ def fake(results: dict[float, int], monkeypatch) -> list:
             pass
 
         def __enter__(self):
-            def run(gate, number, done):
+            def run(gate, number, done, count=1000):
                 ran.append((gate, number))
                 missed = results[gate.threshold] if gate.floor else 0
-                return Tried(gate, missed, 3 if not gate.floor else 0, 0.2, 24.0)
+                return Tried(gate, missed, 3 if not gate.floor else 0, 0.2, 24.0, (0.75, 0.25, 0.5))
 
             return run
 
@@ -88,9 +95,11 @@ def test_the_last_gate_that_passes_is_written_into_the_bundle(
     found = manifest.calibration
     assert (found.missed, found.tried, found.episodes, found.violated_without_floor) == (4, 3, 1000, 3)
     assert [one.gate.threshold for one in tried] == [0.1, 0.2, 0.3, 0.2]
-    assert [gate.floor for gate, _ in ran] == [True, True, True, False]
-    # Fresh episodes for each: no two gates share any.
-    assert len({number for _, number in ran}) == 4
+    assert [gate.floor for gate, _ in ran] == [True, True, True, False, True]
+    assert ran[-1][0] == ran[1][0]
+    assert found.scores == (0.25, 0.5, 0.75)
+    # Fresh episodes for each: no two gates share any, and those to compare with are not the gate's own.
+    assert len({number for _, number in ran}) == 5
     after = Bundle.load(path)
     assert (after.policy, after.multiplier) == (before.policy, before.multiplier)
     gate = Monitor.load(path).gate
@@ -123,6 +132,14 @@ def test_what_can_promise_nothing_is_refused_and_the_bundle_is_as_it_was(
     with pytest.raises(CalibrateError, match=named):
         calibrate(CalibrateConfig(tiny_bundle, **{"thresholds": (0.3,), **changes}), QUIET)
     assert (tiny_bundle / "manifest.json").read_bytes() == before
+
+
+def test_a_bundle_that_cannot_be_written_is_refused_before_anything_is_run(own_bundle, monkeypatch) -> None:
+    (own_bundle / "notes.txt").write_text("mine")
+    ran = fake({0.3: 0}, monkeypatch)
+    with pytest.raises(BundleError, match=r"holds notes\.txt"):
+        calibrate(CalibrateConfig(own_bundle, thresholds=(0.3,)), QUIET)
+    assert not ran
 
 
 def test_it_runs_as_it_is_typed(tiny_bundle: Path, tmp_path: Path) -> None:
@@ -205,3 +222,68 @@ def test_a_report_is_written(tmp_path: Path) -> None:
         for value, low, high in quality["auroc"].values():
             assert 0.0 <= low <= value <= high <= 1.0
     assert (config.report / "warning.png").stat().st_size > 20_000
+
+
+def trained(folder: Path, **changes: object) -> Path:
+    """A run of two epochs."""
+    small = {"total_steps": 400, "num_envs": 4, "epoch_steps": 200, "minibatch": 100, "passes": 1}
+    config = Config(**{"threads": 1, "tensorboard": False, "out": folder, **small, **changes})
+    train(config)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> Path:
+    return trained(tmp_path_factory.mktemp("runs") / "run")
+
+
+def test_the_cost_critic_is_that_of_the_checkpoint(run: Path) -> None:
+    """By hand: the second row of the critics, two layers of tanh, on the features of what it observes."""
+    env = PointGoalVectorEnv(1, 5, num_threads=1)
+    observation, _ = env.reset(seed=0)
+    env.close()
+    arrays, _ = checkpoint.read(run)
+    features = Features(60, surroundings(Config()))
+    state = {name: arrays[f"learner.normaliser.{name}"] for name in ("mean", "variance", "count")}
+    features.normaliser.restore(state["mean"], state["variance"], float(state["count"]))
+    layer = features(torch.from_numpy(observation.astype(np.float32))).detach().numpy()
+    rest = arrays["learner.critics"][1]
+    for k, width in enumerate((64, 64, 1)):
+        weights, biases, rest = np.split(rest, [layer.shape[1] * width, (layer.shape[1] + 1) * width])
+        layer = layer @ weights.reshape(-1, width) + biases
+        layer = np.tanh(layer) if k < 2 else layer
+    found = warning.cost_critic(run, Bundle.load("models/pointgoal1"))(observation)
+    np.testing.assert_allclose(found, layer[:, 0], atol=1e-5)
+    assert np.ptp(found) > 0.0
+
+
+def test_a_report_with_a_run_has_its_cost_critic_and_is_else_the_same(run: Path, tmp_path: Path) -> None:
+    config = CalibrateConfig(Path("models/pointgoal1"), episodes=4, report=tmp_path / "with", run=run)
+    assert warning.report(config, QUIET).row_count == len(warning.SCORES) + 1
+    warning.report(replace(config, report=tmp_path / "without", run=None), QUIET)
+    one, other = (json.loads((tmp_path / name / "warning.json").read_text()) for name in ("with", "without"))
+    critic = one["scores"].pop("cost critic")
+    assert one == other
+    assert all(0.0 <= low <= value <= high <= 1.0 for value, low, high in critic["auroc"].values())
+    assert critic["auroc"] not in [quality["auroc"] for quality in one["scores"].values()]
+    pictures = [(tmp_path / name / "warning.png").read_bytes() for name in ("with", "without")]
+    assert pictures[0] != pictures[1]
+
+
+def test_a_run_that_has_no_critic_for_the_bundle_is_refused(run: Path, tmp_path: Path) -> None:
+    bare = shutil.copytree(run, tmp_path / "bare")
+    (bare / checkpoint.FILE).unlink()
+    cut = shutil.copytree(run, tmp_path / "cut")
+    (cut / checkpoint.FILE).write_bytes((run / checkpoint.FILE).read_bytes()[:-100])
+    for folder, named in (
+        (tmp_path / "nowhere", "nowhere is no run"),
+        (bare, "bare holds no checkpoint"),
+        (cut, "damaged"),
+        (trained(tmp_path / "other", task="PointGoal2-v0"), "of task PointGoal2-v0, .* of PointGoal1-v0"),
+        (trained(tmp_path / "scpo", algorithm="scpo"), "scpo observes more"),
+    ):
+        asked = CalibrateConfig(Path("models/pointgoal1"), episodes=2, report=tmp_path / "out", run=folder)
+        with pytest.raises(CalibrateError, match=f"--run.*{named}") as error:
+            warning.report(asked, QUIET)
+        assert len(str(error.value).splitlines()) == 1
+        assert not (tmp_path / "out").exists()

@@ -53,6 +53,16 @@ def test_what_was_written_is_loaded(own_bundle: Path) -> None:
     assert Manifest.model_validate_json((own_bundle / "manifest.json").read_text()) == bundle.manifest
 
 
+def test_a_setting_of_the_training_that_is_none_is_written_and_a_field_that_is_not_there_is_not(
+    own_bundle: Path,
+) -> None:
+    bundle = Bundle.load(own_bundle)
+    training = {"range": None, "more": {"seed": None, "list": [None]}}
+    manifest = bundle.manifest.model_copy(update={"training": training})
+    assert write_bundle(own_bundle, bundle.policy, bundle.multiplier, manifest).manifest.training == training
+    assert "calibration" not in json.loads((own_bundle / "manifest.json").read_text())
+
+
 def test_the_id_changes_with_anything_in_the_bundle(own_bundle: Path) -> None:
     before = Bundle.load(own_bundle).id
     edit_manifest(own_bundle, lambda m: m.update(threshold=0.25))

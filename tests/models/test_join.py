@@ -11,6 +11,7 @@ import pytest
 from onnx import TensorProto, helper
 
 from models import Bundle, BundleError
+from models.features import read, told, write
 from models.join import join
 
 SHIPPED = Path(__file__).parents[2] / "models" / "pointgoal1"
@@ -37,6 +38,41 @@ def test_what_the_shipped_networks_share_is_computed_once() -> None:
     bundle = Bundle.load(SHIPPED)
     count = {len(onnx.load_from_string(g).graph.node) for g in (bundle.policy, bundle.multiplier)}
     assert len(onnx.load_from_string(bundle.joined()).graph.node) < 1.2 * max(count)
+
+
+def saying(graph: bytes, change: dict[str, object] | None) -> bytes:
+    """A graph that says the same of its features but for a change; None: nothing."""
+    model = onnx.load_from_string(graph)
+    said = read(model)
+    assert said is not None
+    del model.metadata_props[:]
+    if change is not None:
+        write(model, said.model_copy(update=change))
+    return bytes(model.SerializeToString())
+
+
+def test_what_both_say_of_their_features_is_said_by_the_name_in_the_joined_graph() -> None:
+    bundle = Bundle.load(SHIPPED)
+    joined = onnx.load_from_string(bundle.joined())
+    said, own = read(joined), read(onnx.load_from_string(bundle.policy))
+    assert said is not None
+    assert own is not None
+    assert said.tensor != own.tensor
+    assert said.model_copy(update={"tensor": own.tensor}) == own
+    [made] = [node for node in joined.graph.node if said.tensor in node.output]
+    taken = [node for node in joined.graph.node if said.tensor in node.input]
+    assert made.op_type == "Concat"
+    assert [node.op_type for node in taken] == ["Gemm", "Gemm"]
+
+
+@pytest.mark.parametrize("change", [None, {"tensor": "clamp"}, {"tensor": "nowhere"}, {"gain": 4.5}])
+def test_what_only_one_says_of_its_features_is_left_out(change: dict[str, object] | None) -> None:
+    bundle = Bundle.load(SHIPPED)
+    for graphs in (
+        (bundle.policy, saying(bundle.multiplier, change)),
+        (saying(bundle.policy, change), bundle.multiplier),
+    ):
+        assert not told(onnx.load_from_string(join(graphs)))
 
 
 def test_a_graph_and_its_copy_under_another_output_share_all_but_the_end(tiny_bundle: Path) -> None:

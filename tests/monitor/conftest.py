@@ -12,9 +12,9 @@ import pytest
 from decision import MEMORY, Decisions
 from filter import BarrierFilter
 from guide import Guide
+from inference import Networks
 from models import Bundle
 from monitor import GateName, Monitor
-from monitor.networks import Networks
 
 
 class ScriptedNetworks(Networks):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from decision import MEMORY, MOST_OPEN, Mode, OpenedBy
-from monitor import GATES, Gate, MonitorError
+from monitor import GATES, Gate, Monitor, MonitorError
 from pointgoal.observation import HAZARD_RADIUS
 
 
@@ -41,6 +41,16 @@ def test_what_opens_it() -> None:
 def test_what_is_no_gate_is_refused(settings, named) -> None:
     with pytest.raises(MonitorError, match=named):
         Gate(*settings)
+
+
+@pytest.mark.parametrize("threshold", [0.5, 0.0, 0.9])
+def test_a_threshold_beside_a_whole_gate_is_refused(tiny_bundle, threshold) -> None:
+    """It would be ignored, even where it is the gate's own; a gate's name takes it."""
+    gate = Gate("risk", 0.5, dwell=3)
+    with pytest.raises(MonitorError, match="threshold must be None beside a Gate"):
+        Monitor.load(tiny_bundle, gate=gate, threshold=threshold)
+    assert Monitor.load(tiny_bundle, gate=gate).gate == gate
+    assert Monitor.load(tiny_bundle, gate="risk", threshold=threshold).gate.threshold == threshold
 
 
 def opened(gate: Gate, risks: list[float], low: list[bool], changed: list[bool]) -> list[str]:

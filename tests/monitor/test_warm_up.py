@@ -12,12 +12,13 @@ import numpy as np
 from decision import MEMORY
 from filter import kernel, solvers
 from guide import guide
+from inference import features, networks
 from monitor import Monitor
 from pointgoal.lidar import encode
 
 entries = {
     name: entry
-    for room in (kernel, solvers, guide)
+    for room in (kernel, solvers, guide, features, networks)
     for name, entry in vars(room).items()
     if hasattr(entry, "signatures") and entry.__module__ == room.__name__
 }
@@ -46,9 +47,9 @@ assert monitor.faults.counts.total() == 0, monitor.faults.counts
 """
 
 
-def late(tiny_bundle: Path, guide: str) -> str:
+def late(bundle: Path, guide: str) -> str:
     result = subprocess.run(
-        [sys.executable, "-c", SCRIPT, str(tiny_bundle), guide],
+        [sys.executable, "-c", SCRIPT, str(bundle), guide],
         capture_output=True,
         text=True,
         timeout=120,
@@ -59,3 +60,7 @@ def late(tiny_bundle: Path, guide: str) -> str:
 
 def test_one_robot_and_many_run_what_was_compiled_at_load(tiny_bundle: Path) -> None:
     assert late(tiny_bundle, "refusal") == ""
+
+
+def test_nor_are_the_features_compiled_late() -> None:
+    assert late(Path(__file__).parents[2] / "models" / "pointgoal1", "refusal") == ""

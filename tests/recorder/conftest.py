@@ -28,6 +28,8 @@ def reply_to(request: dict[str, Any], **changes: Any) -> dict[str, Any]:
         "reason": None,
         "risk": 0.125,
         "threshold": 0.5,
+        "novelty": 0.25,
+        "suspect": None,
         "opened_by": None,
         "memory": {"side": 0, "guided": 0, "open": 0, "plan": [[0.5, 0.5]]},
         "gate_open": False,

@@ -69,7 +69,15 @@ def test_the_bodies_are_kept_byte_for_byte_and_the_plots_have_what_they_say(
     [
         {},
         {"mode": "filtered", "origin": "barrier", "opened_by": "risk", "hazard": 3, "gate_open": True},
-        {"mode": "fallback", "risk": None, "barrier": None, "nominal_action": None, "reason": "broken"},
+        {"opened_by": "novelty", "novelty": 3.5, "suspect": "gyro"},
+        {
+            "mode": "fallback",
+            "risk": None,
+            "novelty": None,
+            "barrier": None,
+            "nominal_action": None,
+            "reason": "broken",
+        },
         {"memory": {"side": 0, "guided": 0, "open": 0, "plan": None}},
     ],
 )

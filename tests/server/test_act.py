@@ -78,6 +78,8 @@ def decisions() -> st.SearchStrategy[Decision]:
         risk=numbers,
         threshold=numbers,
         opened_by=st.none() | st.sampled_from(OpenedBy),
+        novelty=numbers,
+        suspect=st.none() | st.text(),
         memory=st.builds(
             memory,
             st.integers(-127, 127),

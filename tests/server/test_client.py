@@ -101,6 +101,8 @@ def good(asked: bytes) -> dict[str, object]:
         "risk": 0.1,
         "threshold": 0.5,
         "opened_by": "always",
+        "novelty": None,
+        "suspect": None,
         "memory": {"side": 3, "guided": 1, "open": 0, "plan": PLAN},
         "gate_open": True,
         "gate": "always",

@@ -10,9 +10,9 @@ import pytest
 from fastapi.testclient import TestClient
 
 from filter import BarrierFilter, FilterConfig, Robot
+from inference import Networks
 from models import Bundle
 from monitor import Monitor
-from monitor.networks import Networks
 from pointgoal.observation import HAZARD_RADIUS
 from server import Client
 from server.app import create_app

@@ -11,7 +11,8 @@ SCRIPT = """
 import sys
 heavy = (
     "torch", "mujoco", "gymnasium", "scipy", "onnx", "onnxruntime", "numba", "osqp", "qpsolvers", "fastapi",
-    "starlette", "uvicorn", "tyro", "rich", "monitor", "models", "filter", "guide", "system", "pointgoal",
+    "starlette", "uvicorn", "tyro", "rich", "monitor", "inference", "models", "filter", "guide", "system",
+    "pointgoal",
 )
 for name in heavy:
     sys.modules[name] = None  # an import of it now raises ImportError

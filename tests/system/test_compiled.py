@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-ROOMS = ("decision", "system", "filter", "guide", "monitor", "models", "pointgoal")
+ROOMS = ("decision", "system", "filter", "guide", "inference", "monitor", "models", "pointgoal")
 _DROP_CAPABILITY, _PAST_PERMISSIONS = 24, (1, 2, 3)
 
 FOLDER = """

@@ -7,8 +7,11 @@ import onnxruntime
 import pytest
 import torch
 
+from inference import Networks
+from inference.cut import Cut
 from models import Bundle
-from trainer import export
+from models.features import read
+from trainer import export, onnx_graph
 from trainer.config import Config
 from trainer.errors import CheckpointError, ExportError
 from trainer.export import ExportConfig, TrainedRun
@@ -64,6 +67,30 @@ def test_the_graphs_compute_what_torch_computes(run, bundle):
     assert (trained.multipliers(observation) >= 0).all()
 
 
+@pytest.mark.parametrize("precision", ["single", "double"])
+def test_the_graphs_say_what_their_features_are(run, bundle, precision, caplog):
+    trained = TrainedRun(run)
+    policy, multiplier = (
+        (bundle.policy, bundle.multiplier) if precision == "single" else trained.graphs("double")
+    )
+    said = [read(onnx.load_from_string(graph)) for graph in (policy, multiplier)]
+    assert said[0] == said[1] == onnx_graph.numbers(trained.learner.features)
+    assert all("features" not in names(graph) for graph in (policy, multiplier))
+    networks = Networks(replace(bundle, policy=policy, multiplier=multiplier))
+    assert "lagnet" not in {record.name.split(".")[0] for record in caplog.records}
+    assert isinstance(networks._answer, Cut)
+    observation = np.random.default_rng(0).random((50, 60))
+    action, risk = networks.run(observation)
+    np.testing.assert_allclose(action, trained.actions(observation.astype(np.float32)), atol=1e-5)
+    np.testing.assert_allclose(risk, trained.multipliers(observation.astype(np.float32)), atol=1e-5)
+
+
+def names(graph):
+    """Of a graph's inputs and outputs."""
+    graph = onnx.load_from_string(graph).graph
+    return [value.name for value in (*graph.input, *graph.output)]
+
+
 @pytest.mark.long
 def test_the_graphs_are_exact_for_a_policy_that_reacts_steeply(run):
     trained = TrainedRun(run)
@@ -113,13 +140,16 @@ def test_graphs_that_differ_are_refused(run, tmp_path, monkeypatch):
     assert not (tmp_path / "bundle").exists()
 
 
-def test_an_algorithm_without_multiplier_network_leaves_the_gate_open(tmp_path):
+def test_an_algorithm_without_multiplier_network_leaves_the_gate_open(tmp_path, caplog):
     train(Config(algorithm="ppo", out=tmp_path / "run", **SETTINGS))
     manifest = export.export(
         ExportConfig(tmp_path / "run", tmp_path / "bundle", episodes=2, threads=1, warning_episodes=0)
     )
     assert manifest.threshold < export.NO_NETWORK
     assert "no multiplier network" in manifest.threshold_source
+    bundle = Bundle.load(tmp_path / "bundle")
+    assert Networks(bundle).run(np.zeros((1, 60)))[1] == export.NO_NETWORK
+    assert "lagnet" not in {record.name.split(".")[0] for record in caplog.records}
 
 
 def test_what_cannot_be_a_bundle_is_refused(tmp_path, tiny_task):

@@ -1,0 +1,179 @@
+"""Watches what robots see: learnt from a bundle's own drives, run before every decision."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from decision import Memory
+from novelty.consistency import (
+    GROUPS,
+    count_of_numbers,
+    groups_of_numbers,
+    measure,
+    numbers_of,
+    remember,
+    weigh,
+)
+from system.point_robot import ROBOT, Robot
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+FLOORS = np.array([[1.0, 0.04, 1.0, 0.01, 0.01, 0.01, 0.01], [0.0] * 7])
+"""Least limits: of what a sensor may be off [m/s^2, m/s, rad/s, 1, m], and none of its surprise."""
+BEYOND = 1.25
+"""A limit is this times the largest that was seen."""
+HOLD = 100
+"""For how many control steps a sensor that was caught is not trusted, the first time: 2 s."""
+_RIDGE = 1e-3
+"""Added to the variances, in parts of their mean: no sensor is exact."""
+_LEAST_VARIANCE = 1e-6
+_NAMES = np.array(GROUPS, dtype="<U13")
+
+
+@dataclass(frozen=True)
+class Normal:
+    """What is normal for a policy on its robot.
+
+    Attributes:
+        mean: (m,) of the numbers that `consistency.numbers_of` makes of an observation.
+        precision: (m, m), the inverse of their covariance.
+        least: (3,) the strongest reading that a scan of each lidar shows at least.
+        limits: (2, 7) of each sensor's distance from what physics says, and of its surprise.
+    """
+
+    mean: FloatArray
+    precision: FloatArray
+    least: FloatArray
+    limits: FloatArray
+
+    def to_bytes(self) -> bytes:
+        """An NPZ file of the arrays."""
+        file = io.BytesIO()
+        np.savez_compressed(file, **{name: array.astype(np.float32) for name, array in vars(self).items()})
+        return file.getvalue()
+
+    @staticmethod
+    def from_bytes(data: bytes, observation_size: int) -> Normal:
+        """The inverse of `to_bytes`, for observations of a size.
+
+        Raises:
+            ValueError: if it is not such a file, naming the array that is missing or wrong.
+        """
+        m = count_of_numbers(observation_size)
+        shapes = {"mean": (m,), "precision": (m, m), "least": (3,), "limits": (2, 7)}
+        found = {}
+        try:
+            with np.load(io.BytesIO(data), allow_pickle=False) as file:
+                for name, shape in shapes.items():
+                    array = file[name]
+                    if array.shape != shape or array.dtype.kind != "f" or not np.isfinite(array).all():
+                        raise ValueError(f"{name} must be {list(shape)} finite numbers")
+                    found[name] = array.astype(np.float64)
+        except ValueError:
+            raise
+        except Exception as error:
+            raise ValueError(f"no NPZ file with {', '.join(shapes)}: {error}") from error
+        if not (found["limits"] > 0.0).all():
+            raise ValueError("limits must be above 0")
+        return Normal(**found)
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What is to be said of N observations.
+
+    Attributes:
+        novelty: (N,) the largest distance in parts of its limit.
+        suspect: (N,) the sensors' names where it is above 1, else "".
+        doubted: (N,) whether a sensor that the filter steers by is not trusted.
+        any: whether one is doubted, or suspect.
+        off: (N, 2, 7) the distances.
+    """
+
+    novelty: FloatArray
+    suspect: NDArray[np.str_]
+    doubted: BoolArray
+    any: bool
+    off: FloatArray
+
+
+class Watch:
+    """Looks at observations before anything is decided on them. It keeps nothing: robots' memory does.
+
+    Args:
+        normal: what is.
+        robot: the robot's constants.
+        delay_steps: control steps until an action takes effect, as the filter has them.
+    """
+
+    def __init__(self, normal: Normal, robot: Robot, delay_steps: int = 0) -> None:
+        self.normal = normal
+        self._robot = np.array([tuple(robot)], ROBOT)
+        self._delay = delay_steps
+        self._tables = _tables(normal)
+
+    def look(self, observation: FloatArray, memory: Memory) -> Findings:
+        """What is to be said of N observations (N, O), which are finite, given the robots' memory (N,)."""
+        n = len(observation)
+        off = np.empty((n, 2, 7))
+        measure(self._robot, self._delay, observation, memory, self.normal.least, self._tables, off)
+        novelty, which, doubted = np.empty(n), np.empty(n, np.int64), np.empty(n, np.bool_)
+        any_of_them = weigh(off, self.normal.limits, memory, novelty, which, doubted)
+        suspect = np.where(novelty > 1.0, _NAMES[which], "") if any_of_them else _nobody(n)
+        return Findings(novelty, suspect, doubted, any_of_them, off)
+
+    def remember(self, observation: FloatArray, findings: Findings, memory: Memory) -> None:
+        """Write into N robots' memory what was seen, and what is not trusted."""
+        remember(observation, findings.off, self.normal.limits, HOLD, memory)
+
+
+@lru_cache(maxsize=64)
+def nothing(n: int) -> Findings:
+    """What is to be said of N observations that nobody looks at."""
+    return Findings(np.full(n, np.nan), _nobody(n), np.zeros(n, np.bool_), False, np.empty((n, 2, 7)))
+
+
+def learn(observation: FloatArray) -> Normal:
+    """What is normal, from observations (n, O) of a policy's own drives; the limits are still to be found."""
+    numbers = np.empty((len(observation), count_of_numbers(observation.shape[1])))
+    numbers_of(np.ascontiguousarray(observation, np.float64), numbers)
+    covariance = np.cov(numbers.T)
+    ridge = _RIDGE * np.maximum(np.diag(covariance), np.diag(covariance).mean()) + _LEAST_VARIANCE
+    precision = np.asarray(np.linalg.inv(covariance + np.diag(ridge)), np.float64)
+    mean: FloatArray = numbers.mean(axis=0)
+    return Normal(mean, precision, np.zeros(3), np.full((2, 7), np.inf))
+
+
+def calibrate(normal: Normal, largest: FloatArray, least: FloatArray) -> Normal:
+    """With the limits that leave out what was seen.
+
+    Args:
+        normal: what was learnt.
+        largest: (2, 7) the largest distances in drives that nothing was learnt from.
+        least: (3,) the least of their scans' strongest readings, for each lidar.
+    """
+    limits = np.maximum(BEYOND * largest, FLOORS)
+    return Normal(normal.mean, normal.precision, 0.5 * least, np.maximum(limits, 1e-6))
+
+
+@lru_cache(maxsize=64)
+def _nobody(n: int) -> NDArray[np.str_]:
+    return np.full(n, "", dtype="<U13")
+
+
+def _tables(normal: Normal) -> tuple[FloatArray, FloatArray, Any, Any, FloatArray]:
+    """What `consistency.surprise` takes."""
+    order, bounds = groups_of_numbers(len(normal.mean))
+    inverse = np.zeros_like(normal.precision)
+    for first, last in pairwise(bounds.tolist()):
+        block = order[first:last]
+        inverse[first:last, first:last] = np.linalg.inv(normal.precision[np.ix_(block, block)])
+    return normal.mean, normal.precision, order, bounds, inverse
