@@ -16,6 +16,7 @@ import threading
 import time
 from contextlib import ExitStack
 from dataclasses import dataclass
+from itertools import cycle
 from pathlib import Path
 from typing import Annotated, Any
 from urllib.parse import urlsplit
@@ -62,18 +63,18 @@ class ServerBenchmark:
 
 
 class Connection:
-    """One keep-alive HTTP connection that sends the same request again and again."""
+    """One keep-alive HTTP connection that sends the same requests again and again, in turn."""
 
-    def __init__(self, url: str, body: bytes) -> None:
+    def __init__(self, url: str, *bodies: bytes) -> None:
         address = urlsplit(url)
         self._socket = socket.create_connection((address.hostname, address.port))
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         head = f"POST {address.path} HTTP/1.1\r\nhost: {address.netloc}\r\ncontent-type: application/json\r\n"
-        self._request = f"{head}content-length: {len(body)}\r\n\r\n".encode() + body
+        self._requests = cycle([f"{head}content-length: {len(b)}\r\n\r\n".encode() + b for b in bodies])
 
     def exchange(self) -> bytes:
         """One request; its reply's body. Raises RuntimeError if it is not a 200."""
-        self._socket.sendall(self._request)
+        self._socket.sendall(next(self._requests))
         reply = b""
         while b"\r\n\r\n" not in reply:
             reply += self._receive()

@@ -66,6 +66,7 @@ MEMORY = np.dtype(
 - ``plan``: (PLAN_STEPS, 2) what is left of the certified backup, action by action; after it the robot coasts.
 """
 
+_WHOLE = np.dtype(f"V{MEMORY.itemsize}")
 Memory = NDArray[np.void]
 """(N,) of `MEMORY`: rows are taken, masked and joined like any array's."""
 
@@ -83,6 +84,11 @@ def memory_of(count: int, memory: Memory | np.void | None) -> Memory:
     return np.ascontiguousarray(memory).reshape(count)
 
 
+def copy_of(memory: Memory) -> Memory:
+    """A copy of N robots' memory, whole: numpy would copy field by field, for 3 us."""
+    return memory.view(_WHOLE).copy().view(MEMORY)
+
+
 def next_of_plan(memory: Memory) -> tuple[NDArray[np.float64], Memory]:
     """The plans' next actions (N, 2), coasting where a plan has ended, and the memory without them.
 
@@ -91,7 +97,7 @@ def next_of_plan(memory: Memory) -> tuple[NDArray[np.float64], Memory]:
     action = memory["plan"][:, 0]
     going = (memory["left"] > 0) & (np.abs(action) <= 1.0).all(axis=1)
     action = np.where(going[:, None], action, 0.0)
-    after = memory.copy()
+    after = copy_of(memory)
     after["plan"][:, :-1] = memory["plan"][:, 1:]
     after["plan"][:, -1] = 0.0
     after["left"] = np.where(going, np.minimum(memory["left"], PLAN_STEPS) - 1, 0)

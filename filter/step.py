@@ -8,7 +8,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from decision import Decisions, Memory, Mode, OpenedBy, Origin, next_of_plan, texts, unknown
+from decision import Decisions, Memory, Mode, OpenedBy, Origin, copy_of, next_of_plan, texts, unknown
 from filter import kernel
 from filter.certificate import CERTIFICATE
 from filter.scene import DOUBT, Scene
@@ -52,7 +52,7 @@ class Step:
         self.active = active
         self.certificates = np.empty(n, CERTIFICATE)
         self.certified = np.empty(n, np.bool_)
-        self.memory, self._before = memory.copy(), memory
+        self.memory, self._before = copy_of(memory), memory
         self._mode, self._origin = texts(Mode.NOMINAL, n), texts("", n)
         self._hazard = _nowhere(n)
         self._reason: list[str | None] = [None] * n

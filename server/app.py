@@ -9,6 +9,7 @@ from fastapi import FastAPI
 from fastapi.responses import JSONResponse
 
 from monitor import Monitor
+from recorder import Recorder
 from server.desk import Desk
 from server.guard import ACT, BATCH, Guard
 from server.schema import MAX_ROBOTS, ActReply, ActRequest, BatchReply, ModelReply
@@ -39,7 +40,11 @@ class Lifecycle:
 
 
 def create_app(
-    monitor: Monitor, lifecycle: Lifecycle | None = None, api_key: str | None = None, max_body: int = MAX_BODY
+    monitor: Monitor,
+    lifecycle: Lifecycle | None = None,
+    api_key: str | None = None,
+    max_body: int = MAX_BODY,
+    recorder: Recorder | None = None,
 ) -> Guard:
     """The service around one monitor that is loaded and warmed up.
 
@@ -48,6 +53,7 @@ def create_app(
         lifecycle: shared with whoever stops the service.
         api_key: the key that every request but the health checks must carry; None asks for none.
         max_body: most bytes of a request's body; a batch's may be `BATCH_BODY` times as large.
+        recorder: what records the decisions, if any does.
     """
     state = lifecycle or Lifecycle()
     model = ModelReply.of(monitor)
@@ -73,8 +79,9 @@ def create_app(
         return model
 
     @app.get("/healthz")
-    async def healthz() -> dict[str, str]:
-        return {"status": "alive"}
+    async def healthz() -> dict[str, Any]:
+        # A service that can no longer record is alive, and says so.
+        return {"status": "alive"} | ({} if recorder is None else {"recording": recorder.status()})
 
     @app.get("/readyz", responses={503: {"description": "draining, or degraded by its own faults"}})
     async def readyz() -> JSONResponse:
@@ -85,7 +92,7 @@ def create_app(
             return JSONResponse({"status": "degraded", "internal_faults": faults}, status_code=503)
         return JSONResponse({"status": "ready"})
 
-    return Guard(Desk(app, monitor, model), api_key, max_body, {BATCH: BATCH_BODY * max_body})
+    return Guard(Desk(app, monitor, model, recorder), api_key, max_body, {BATCH: BATCH_BODY * max_body})
 
 
 def _act_schema(model: ModelReply) -> dict[str, Any]:

@@ -20,12 +20,15 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from decision import MEMORY, Decision, Memory, memory_from_json
 from monitor import Monitor
+from recorder import Recorder
 from server.guard import ACT, AT_ONCE, BATCH, BodyTooLargeError
 from server.schema import ActRequest, BatchReply, BatchRequest, ModelReply, Refusal, Reply, reply_of
 
 FloatArray = NDArray[np.float64]
 
 _MAX_ERRORS = 8
+_RECORDED = (200, 500)
+"""The statuses of decisions, and of those that could not be told."""
 _QUICK = 0.005
 """A decision within this time is made at once [s]: a health check may wait for it."""
 _QUICK_ENOUGH = 20
@@ -61,12 +64,16 @@ class Desk:
         app: what answers the other paths.
         monitor: what decides.
         model: what it told of itself.
+        recorder: what records the decisions, if any does.
     """
 
-    def __init__(self, app: ASGIApp, monitor: Monitor, model: ModelReply) -> None:
+    def __init__(
+        self, app: ASGIApp, monitor: Monitor, model: ModelReply, recorder: Recorder | None = None
+    ) -> None:
         self._app = app
         self._monitor = monitor
         self._model = model
+        self._recorder = recorder
         self._thread = ThreadPoolExecutor(1, "decisions")
         self._quick = 0
         self._answers = {ACT: self._one, BATCH: self._batch}
@@ -83,12 +90,19 @@ class Desk:
         except BodyTooLargeError as error:
             status, answer = _problem(413, [([], str(error), "too_large")])
         else:
+            received = time.time_ns()
             if self._quick >= _QUICK_ENOUGH and scope["path"] == ACT:
                 status, answer = answers(content, started)
             else:
                 loop = asyncio.get_running_loop()
                 status, answer = await loop.run_in_executor(self._thread, answers, content, started)
+            if self._recorder is not None and status in _RECORDED:
+                self._recorder.record(received, scope.get("client"), status, content, answer)
         await _reply(scope, send, status, answer)
+
+    def answer(self, content: bytes, batch: bool) -> Answer:
+        """The answer to the body of a `POST /act`, or of a `POST /act/batch`."""
+        return self._answers[BATCH if batch else ACT](content, time.perf_counter())
 
     def _one(self, content: bytes, started: float) -> Answer:
         """Answers the body of `POST /act`."""

@@ -11,7 +11,8 @@ import os
 import socket
 import sys
 import time
-from dataclasses import dataclass
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import FrameType
 from typing import Annotated
@@ -19,18 +20,22 @@ from typing import Annotated
 import tyro
 import uvicorn
 
-from command import command, settings
+from command import command, settings, why_not_folder
 from filter import FilterConfig
 from models import BundleError
 from monitor import DEFAULT_STRENGTH, GateName, Monitor, MonitorError, Strength
+from recorder import Recorder, RecordingError, Settings
 from server.app import MAX_BODY, Lifecycle, create_app
 from server.door import Connection, Door, Patience
 from server.guard import Guard
+from server.schema import ModelReply
 
 KEY_VARIABLE = "LAGNET_API_KEY"
 """Environment variable that may hold the key."""
 _OTHER_FILES = 64
 """Files that are open beside the connections."""
+LEAST_FILE = 4.0
+"""Size that a file may at least have [MB]: the largest batch fits."""
 _LAST_WORDS = 5
 """How long requests in flight may take once the service has closed its door [s]."""
 
@@ -82,6 +87,16 @@ class ServeConfig:
     """How long a connection may be silent between two requests [s]."""
     drain_seconds: float = 0.5
     """How long /readyz says 503 before the service stops accepting connections [s]."""
+    record: Path | None = None
+    """Folder in which every decision is recorded with its input (MCAP), and every incident."""
+    record_mb: float = 4096.0
+    """Size of all recordings in it [MB]; where they come to more, the oldest go."""
+    record_file_mb: float = 64.0
+    """Size of one recording [MB]; then the next one begins."""
+    incidents: Path | None = None
+    """Folder for the last 30 s before every fallback or alarm; by default that of --record."""
+    incidents_mb: float = 256.0
+    """Size of all files of incidents in it [MB]; where they come to more, the oldest go."""
 
     def filter_config(self) -> FilterConfig:
         """The filter's settings, or ServeError for one that is out of its range."""
@@ -104,6 +119,33 @@ class ServeConfig:
                 raise ServeError(f"{flag} must be finite and above 0, got {seconds}")
         if not (math.isfinite(self.drain_seconds) and self.drain_seconds >= 0.0):
             raise ServeError(f"--drain-seconds must be finite and at least 0, got {self.drain_seconds}")
+        self._check_recording()
+
+    def _check_recording(self) -> None:
+        sizes = (
+            ("--record-file-mb", self.record_file_mb, LEAST_FILE),
+            ("--record-mb", self.record_mb, 2.0 * self.record_file_mb),
+            ("--incidents-mb", self.incidents_mb, 4.0 * LEAST_FILE),
+        )
+        for flag, size, least in sizes:
+            if not (math.isfinite(size) and size >= least):
+                raise ServeError(f"{flag} must be finite and at least {least:g}, got {size}")
+        for flag, folder in (("--record", self.record), ("--incidents", self.incidents)):
+            if folder is not None and (why := why_not_folder(folder)) is not None:
+                raise ServeError(f"{flag} {folder} {why}")
+
+    def recording(self) -> Settings | None:
+        """What is recorded where; None if nothing is."""
+        incidents = self.record if self.incidents is None else self.incidents
+        if incidents is None:
+            return None
+        return Settings(
+            record=None if self.record is None else str(self.record),
+            record_bytes=int(self.record_mb * 1e6),
+            file_bytes=int(self.record_file_mb * 1e6),
+            incidents=str(incidents),
+            incidents_bytes=int(self.incidents_mb * 1e6),
+        )
 
 
 class DrainingServer(uvicorn.Server):
@@ -222,6 +264,7 @@ def serve(config: ServeConfig) -> None:
         ServeError: for settings or an address that cannot be had.
         BundleError: if the bundle must not be used.
         MonitorError: if it cannot be run with these settings.
+        RecordingError: if it cannot be recorded.
     """
     config.check()
     api_key = read_api_key(config.api_key_file)
@@ -232,16 +275,29 @@ def serve(config: ServeConfig) -> None:
             config.bundle, config.gate, config.threshold, config.filter_config(), config.guide
         )
         lifecycle = Lifecycle()
-        app = create_app(monitor, lifecycle, api_key, config.max_body)
         host, port = listener.getsockname()[:2]
         url = f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
         ready = {"event": "listening", "url": url, "host": host, "port": port, "model": monitor.bundle.id}
         gate = {"gate": monitor.gate.name, "threshold": monitor.gate.threshold, "guide": config.guide}
         announcement = json.dumps(ready | gate)
-        # What is loaded stays: looking through it again and again for garbage would hold up decisions.
-        gc.collect()
-        gc.freeze()
-        _server(app, lifecycle, config, announcement).run(sockets=[listener])
+        with recorder_of(config, monitor) as recorder:
+            app = create_app(monitor, lifecycle, api_key, config.max_body, recorder)
+            # What is loaded stays: looking through it again and again for garbage would hold up decisions.
+            gc.collect()
+            gc.freeze()
+            _server(app, lifecycle, config, announcement).run(sockets=[listener])
+
+
+def recorder_of(config: ServeConfig, monitor: Monitor) -> AbstractContextManager[Recorder | None]:
+    """What records, until its context ends; nothing where nothing is to be recorded.
+
+    Raises:
+        RecordingError: if it cannot start.
+    """
+    wanted = config.recording()
+    if wanted is None:
+        return nullcontext()
+    return Recorder(wanted, ModelReply.of(monitor).model_dump(), asdict(config.filter_config()))
 
 
 def _server(app: Guard, lifecycle: Lifecycle, config: ServeConfig, announcement: str) -> DrainingServer:
@@ -263,7 +319,7 @@ def _server(app: Guard, lifecycle: Lifecycle, config: ServeConfig, announcement:
 
 def main() -> None:
     """Entry point of `lagnet-serve`: exit status 0 after an orderly stop, 2 if it could not start."""
-    with command("lagnet-serve", ServeError, BundleError, MonitorError):
+    with command("lagnet-serve", ServeError, BundleError, MonitorError, RecordingError):
         serve(settings(ServeConfig, "lagnet-serve"))
 
 

@@ -26,7 +26,10 @@ MAY_IMPORT: dict[str, set[str]] = {
     "monitor": {
         *("decision", "system", "filter", "guide", "inference", "novelty", "models", "pointgoal.observation"),
     },
-    "server": {"command", "decision", "monitor", "models", "filter", "guide", "pointgoal.observation"},
+    "recorder": set(),
+    "server": {
+        *("command", "decision", "monitor", "models", "filter", "guide", "recorder", "pointgoal.observation"),
+    },
     "evaluation": {
         *(
             "command",
@@ -40,6 +43,7 @@ MAY_IMPORT: dict[str, set[str]] = {
             "novelty",
             "trainer",
             "monitor",
+            "recorder",
             "server",
         ),
     },
@@ -50,7 +54,7 @@ MOST_LINES_OF_THE_FILTERS_CLASS = 150
 HEAVY = {"torch", "mujoco", "gymnasium", "matplotlib", "PIL", "scipy", "ray", "tensorboard"}
 RUNTIME = (
     *("command", "models", "decision", "system", "filter", "guide", "inference", "novelty", "monitor"),
-    "server",
+    *("recorder", "server"),
 )
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 SCRIPTS = PROJECT["project"]["scripts"]

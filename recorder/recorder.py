@@ -1,0 +1,218 @@
+"""The service's side of the recorder: hands every exchange on to the recorder's process, and never waits."""
+
+from __future__ import annotations
+
+import json
+import logging
+import subprocess
+import sys
+import time
+from collections import deque
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from threading import Event, Thread
+from types import TracebackType
+from typing import IO, Any, Self, cast
+
+from recorder.errors import RecordingError
+from recorder.frames import frame
+
+HAND_ON_SECONDS = 0.05
+"""How often what has been recorded is handed on [s]."""
+MOST_WAITING = 64 << 20
+"""Bytes that may wait to be handed on; what comes on top is dropped, and counted."""
+_START_SECONDS = 30.0
+_END_SECONDS = 5.0
+_QUIET_SECONDS = 60.0
+_PIPE = 1 << 20
+
+_LOG = logging.getLogger("lagnet.recorder")
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What is recorded where.
+
+    Attributes:
+        record: folder for everything, or None.
+        record_bytes: size of all its recordings; the oldest go.
+        file_bytes: size of one.
+        incidents: folder for incidents, or None.
+        incidents_bytes: size of all its files of incidents; the oldest go.
+    """
+
+    record: str | None
+    record_bytes: int
+    file_bytes: int
+    incidents: str | None
+    incidents_bytes: int
+
+
+class Recorder:
+    """Records what a service is asked and answers.
+
+    Args:
+        settings: what and where.
+        model: what decides, as `GET /model` tells it.
+        filter_config: the filter's settings, as plain JSON.
+
+    Attributes:
+        dropped: how many exchanges were not recorded because too many were waiting.
+
+    Raises:
+        RecordingError: if it cannot start.
+    """
+
+    def __init__(
+        self, settings: Settings, model: Mapping[str, Any], filter_config: Mapping[str, Any]
+    ) -> None:
+        self.dropped = 0
+        self._stopped: dict[str, str] = {}
+        self._status: dict[str, Any] = {}
+        self._waiting: deque[tuple[Any, ...] | str] = deque()
+        # Each of the two is written by one thread.
+        self._taken = self._handed = 0
+        self._number = 0
+        self._gone = False
+        self._closing, self._ready = Event(), Event()
+        self._failed: str | None = None
+        release = version("lagnet")
+        text = {"version": release, "model": json.dumps(model), "filter": json.dumps(filter_config)}
+        about = {"version": release, "text": text, "layout": list(model["observation_layout"])}
+        # What it says besides goes where the service's own complaints go.
+        command = [sys.executable, "-m", "recorder.process"]
+        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+        self._pipe = cast(IO[bytes], self._process.stdin)
+        self._words = cast(IO[bytes], self._process.stdout)
+        _widen(self._pipe)
+        self._listener = Thread(target=self._listen, name="recorder listens", daemon=True)
+        self._listener.start()
+        self._send(asdict(settings) | {"about": about})
+        if not self._ready.wait(_START_SECONDS) or self._failed is not None or self._gone:
+            self._process.kill()
+            self._process.wait()
+            raise RecordingError(self._failed or "the recorder's process did not start")
+        self._sender = Thread(target=self._hand_on, name="recorder sends", daemon=True)
+        self._sender.start()
+
+    @property
+    def alarm(self) -> str | None:
+        """What is no longer recorded, and why; None while all is well."""
+        return "; ".join(f"{what} stopped: {why}" for what, why in sorted(self._stopped.items())) or None
+
+    def status(self) -> dict[str, Any]:
+        """How it stands, as plain JSON: alarm, dropped, recorded, incidents, last_incident."""
+        told = {name: value for name, value in self._status.items() if name != "stopped"}
+        return {"alarm": self.alarm, "dropped": self.dropped} | told
+
+    def record(
+        self, received: int, client: tuple[str, int] | None, status: int, request: bytes, reply: bytes
+    ) -> None:
+        """Records a request and its reply; to be called from one thread alone.
+
+        Args:
+            received: when the request had come [ns since 1970].
+            client: address and port of who asked.
+            status: the reply's.
+            request: its body.
+            reply: its body.
+        """
+        if self._gone:
+            return
+        self._number += 1
+        size = len(request) + len(reply)
+        if self._taken - self._handed + size > MOST_WAITING:
+            self.dropped += 1
+            return
+        self._taken += size
+        self._waiting.append((self._number, received, time.time_ns(), client, status, request, reply))
+
+    def incident(self, why: str) -> None:
+        """Has the last half minute written; for alarms, from any thread.
+
+        Args:
+            why: what has happened.
+        """
+        self._waiting.append(why)
+
+    def close(self) -> None:
+        """Ends the recording: what was recorded up to now is written."""
+        self._closing.set()
+        self._sender.join(_END_SECONDS)
+        try:
+            self._process.wait(_END_SECONDS)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._listener.join(_END_SECONDS)
+        self._words.close()
+
+    def __enter__(self) -> Self:
+        """The recorder."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Ends the recording."""
+        self.close()
+
+    def _hand_on(self) -> None:
+        """Sends what has been recorded, again and again, and at the end that it is the end."""
+        logged, quiet = 0, 0.0
+        while not self._gone:
+            last = self._closing.wait(HAND_ON_SECONDS)
+            batch, size = [], 0
+            while self._waiting:
+                item = self._waiting.popleft()
+                batch.append(item)
+                size += 0 if isinstance(item, str) else len(item[-1]) + len(item[-2])
+            # An empty one as well: the other side has no clock of its own.
+            self._send(batch)
+            self._handed += size
+            if self.dropped > logged and time.monotonic() >= quiet:
+                logged, quiet = self.dropped, time.monotonic() + _QUIET_SECONDS
+                _LOG.warning("%d decisions were not recorded so far: too many at once", logged)
+            if last:
+                self._send(None)
+                break
+        self._waiting.clear()
+        with suppress(OSError):
+            self._pipe.close()
+
+    def _send(self, value: Any) -> None:
+        try:
+            self._pipe.write(frame(value))
+            self._pipe.flush()
+        except OSError:
+            self._gone = True
+
+    def _listen(self) -> None:
+        """Hears how the other process stands, until it ends."""
+        for line in self._words:
+            told = json.loads(line)
+            self._failed = told.pop("failed", None)
+            for what, why in told.get("stopped", {}).items():
+                self._stop(what, why)
+            self._status = told
+            self._ready.set()
+        self._gone = True
+        if not self._closing.is_set() and self._failed is None:
+            self._stop("recorder", "its process ended")
+        self._ready.set()
+
+    def _stop(self, what: str, why: str) -> None:
+        if what not in self._stopped:
+            self._stopped = self._stopped | {what: why}
+            _LOG.error("%s stopped: %s; the service goes on", what, why)
+
+
+def _widen(pipe: IO[bytes]) -> None:
+    """Lets a pipe hold more, where that can be set: what it holds outlives a service that is killed."""
+    if sys.platform == "linux":
+        import fcntl
+
+        with suppress(OSError):
+            fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, _PIPE)
