@@ -31,7 +31,7 @@ FLOORS = np.array([[0.5, 0.02, 0.5, 0.002, 0.002, 0.002, 0.002], [0.0] * 7])
 BEYOND = 1.5
 """A limit is this times the largest that was seen."""
 HOLD = np.array([100, 500])
-"""For how many control steps a sensor that was caught is not trusted the first and the second time: 2 s, 10 s.
+"""For how many control steps a sensor that was caught is not trusted: the first time 2 s, the second 10 s.
 After the third it takes somebody to say that it is in order, by a new memory."""
 _RIDGE = 1e-3
 """Added to the variances, in parts of their mean: no sensor is exact."""

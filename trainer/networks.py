@@ -1,7 +1,7 @@
 """The networks, as pure functions of flat parameter vectors.
 
-All of them are perceptrons with two hidden layers of tanh units, 64 but for an exported λ. A network's parameters are one vector,
-so that an optimiser, a trust region and a checkpoint each handle one tensor.
+All of them are perceptrons with two hidden layers of tanh units, 64 but for an exported λ. A network's
+parameters are one vector, so that an optimiser, a trust region and a checkpoint each handle one tensor.
 """
 
 from collections.abc import Callable
