@@ -37,6 +37,7 @@ _CAUSES = {
     OpenedBy.DWELL: "#cdb4e6",
     OpenedBy.BARRIER: "#70a80b",
     OpenedBy.ALWAYS: "#0077b6",
+    OpenedBy.NOVELTY: "#d62828",
     OpenedBy.FAULT: "#000000",
 }
 """Of what opened the gate."""

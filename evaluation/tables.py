@@ -22,6 +22,7 @@ _CAUSES = {
     OpenedBy.RISK: "by risk",
     OpenedBy.DWELL: "it stayed open",
     OpenedBy.BARRIER: "by barrier alone",
+    OpenedBy.NOVELTY: "by novelty",
     OpenedBy.FAULT: "by fault",
 }
 _ORIGINS = {

@@ -70,18 +70,16 @@ class Normal:
         """
         m = count_of_numbers(observation_size)
         shapes = {"mean": (m,), "precision": (m, m), "least": (3,), "limits": (2, 7)}
-        found = {}
         try:
             with np.load(io.BytesIO(data), allow_pickle=False) as file:
-                for name, shape in shapes.items():
-                    array = file[name]
-                    if array.shape != shape or array.dtype.kind != "f" or not np.isfinite(array).all():
-                        raise ValueError(f"{name} must be {list(shape)} finite numbers")
-                    found[name] = array.astype(np.float64)
-        except ValueError:
-            raise
+                found = {name: np.asarray(file[name]) for name in shapes}
         except Exception as error:
             raise ValueError(f"no NPZ file with {', '.join(shapes)}: {error}") from error
+        for name, shape in shapes.items():
+            array = found[name]
+            if array.shape != shape or array.dtype.kind != "f" or not np.isfinite(array).all():
+                raise ValueError(f"{name} must be {list(shape)} finite numbers")
+            found[name] = array.astype(np.float64)
         if not (found["limits"] > 0.0).all():
             raise ValueError("limits must be above 0")
         return Normal(**found)
