@@ -6,7 +6,7 @@ import json
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -49,6 +49,9 @@ class EvaluateConfig:
     """When the filter is active: where the risk score or the barrier asks for it (default), always, never."""
     threshold: float | None = None
     """Risk score above which the gate `risk` activates the filter; by default the bundle's."""
+    floor: bool = True
+    """Whether the gate `risk` opens where the barrier is low, whatever λ says. Without, nothing is certified
+    where λ is silent: to measure what λ is worth."""
     guide: Strength | None = None
     """How much the guide may do: nothing, lead from a refused action on (the default), lead ahead."""
     hazards: Literal["lidar", "given", "both"] = "lidar"
@@ -109,8 +112,13 @@ def _decider(config: EvaluateConfig, bundle: Bundle) -> Iterator[tuple[BatchDeci
         guide = config.guide or DEFAULT_STRENGTH
         monitor = Monitor.load(config.bundle, config.gate or "risk", config.threshold, guide=guide)
         gate = monitor.gate
+        if not config.floor:
+            gate = replace(gate, floor=False)
+            monitor = Monitor.load(config.bundle, gate, guide=guide)
         yield monitor, {"model": bundle.id, "gate": gate.name, "threshold": gate.threshold, "guide": guide}
         return
+    if not config.floor:
+        raise EvaluateError("--no-floor is not for a service: its gate has a floor")
     from evaluation.remote import asked
 
     wanted = layout(bundle.manifest.level).to_json()
