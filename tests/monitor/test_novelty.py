@@ -28,6 +28,8 @@ def under_way(bundle, drive):
     """Robots that have driven for a while behind a healthy monitor: observations, hazards, memory."""
     monitor, memory = Monitor.load(bundle), np.zeros(N, MEMORY)
     for now in drive(BEFORE, n=N):
+        if now.step == BEFORE:
+            break
         decided = monitor.decide_batch(now.observation, None, memory)
         assert (decided.novelty <= 1.0).all()
         assert (decided.suspect == "").all()
