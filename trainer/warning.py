@@ -68,8 +68,8 @@ class WarningConfig:
     """
 
     episodes: int = 300
-    discount: float = 0.97
-    floor: float = 0.3
+    discount: float = 0.96
+    floor: float = 0.22
     minibatches: int = 20_000
     minibatch: int = 2000
     learning_rate: float = 1e-3
