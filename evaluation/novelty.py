@@ -15,7 +15,7 @@ from decision import MEMORY
 from evaluation.errors import CalibrateError
 from models import Bundle, Manifest, NoveltySource, check_target, write_bundle
 from monitor import Monitor
-from novelty import GROUPS, Normal, Watch, calibrate, learn
+from novelty import FLOORS, Normal, Watch, calibrate, learn
 from pointgoal import seeds
 from pointgoal.loop import SIDE_BY_SIDE, drive, groups, side_by_side
 from pointgoal.observation import LIDAR_BINS
@@ -41,7 +41,7 @@ class Seen:
 
     Attributes:
         observations: every tenth of them.
-        largest: (2, 7) the largest distances that a watch found.
+        largest: (3, 7) the largest distances that a watch found.
         least: (3,) the least of the scans' strongest readings, for each lidar.
     """
 
@@ -92,9 +92,9 @@ def look_around(
     monitor: Monitor, normal: Normal, rows: list[int], hazards: str, done: Any = lambda count: None
 ) -> Seen:
     """Drives one episode for each row, in the closed loop, and measures what is seen; no limit is applied."""
-    unlimited = replace(normal, limits=np.full((2, 7), np.inf), least=np.zeros(3))
+    unlimited = replace(normal, limits=np.full(FLOORS.shape, np.inf), least=np.zeros(3))
     watch = Watch(unlimited, monitor.robot)
-    seen = Seen([], np.zeros((2, len(GROUPS))), np.ones(3))
+    seen = Seen([], np.zeros(FLOORS.shape), np.ones(3))
     level, size = monitor.bundle.manifest.level, side_by_side(len(rows), SIDE_BY_SIDE)
     with closing(PointGoalVectorEnv(level=level, num_envs=size, num_threads=1)) as env:
         for part in groups(len(rows), size):

@@ -1,6 +1,6 @@
 """Whether what a robot sees is what it should see, by physics and by what its policy has seen so far."""
 
 from novelty.consistency import GROUPS, STEERED_BY
-from novelty.watch import Findings, Normal, Watch, calibrate, learn, nothing
+from novelty.watch import FLOORS, Findings, Normal, Watch, calibrate, learn, nothing
 
-__all__ = ["GROUPS", "STEERED_BY", "Findings", "Normal", "Watch", "calibrate", "learn", "nothing"]
+__all__ = ["FLOORS", "GROUPS", "STEERED_BY", "Findings", "Normal", "Watch", "calibrate", "learn", "nothing"]

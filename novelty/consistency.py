@@ -39,8 +39,9 @@ _NEAR = (0.4, 0.0, 0.4)
 """Goals and vases nearer than this may be met, or moved [m]; hazards stay where they are."""
 NEVER = 1e9
 """A distance beyond every limit."""
-FROZEN = (0.3, 0.01, 0.2, 0.005, 0.001, 0.001, 0.001)
-"""A sensor whose numbers are to the last bit what they were is frozen if they should have changed by this."""
+OFF, FROZEN, SURPRISE = 0, 1, 2
+"""The kinds of distances of a sensor: from what physics says; by how much its numbers should have changed, if
+they are to the last bit what they were; from what the other sensors let expect."""
 
 
 @compiled
@@ -130,7 +131,7 @@ def _acceleration(robot: Robot, vx: float, yaw_rate: float, u1: float) -> float:
 
 @compiled
 def compare(robot: Robot, delay: int, now: FloatArray, past: Any, least: FloatArray, off: FloatArray) -> None:
-    """How far each sensor is from what it should show; ``off`` (7,) receives it, 0 where nothing is known.
+    """How far each sensor is from what it should show, 0 where nothing is known.
 
     Args:
         robot: the constants.
@@ -138,14 +139,16 @@ def compare(robot: Robot, delay: int, now: FloatArray, past: Any, least: FloatAr
         now: (60,) or (28,) the observation.
         past: one of `HISTORY`, before this step.
         least: (3,) the strongest reading that a scan of each lidar shows at least.
-        off: in m/s^2, m/s, rad/s, 1, and m for the lidars; `NEVER` for a frozen or an empty sensor.
+        off: (3, 7) receives the kinds `OFF` and `FROZEN`, in m/s^2, m/s, rad/s, 1, and m for the lidars;
+            `NEVER` for an empty one.
     """
-    off[:] = 0.0
+    off[:SURPRISE] = 0.0
+    physics, frozen = off[OFF], off[FROZEN]
     lidars = (len(now) - _LIDARS) // LIDAR_BINS
     for lidar in range(lidars):
         i = _LIDARS + lidar * LIDAR_BINS
         if now[i : i + LIDAR_BINS].max() < least[lidar]:
-            off[4 + lidar] = NEVER
+            physics[4 + lidar] = NEVER
     if past.age < 1 or delay + past.age > MOST_LATE + 1:
         return
     before, sent = past.sensed, past.sent
@@ -155,21 +158,21 @@ def compare(robot: Robot, delay: int, now: FloatArray, past: Any, least: FloatAr
     ahead, aside = in_own_frame(at.x + at.vx, at.y + at.vy, at)
     mx, my = in_own_frame(at.x + before[_MAGNETOMETER], at.y + before[_MAGNETOMETER + 1], at)
     pushed = _acceleration(robot, ahead, at.yaw_rate, sent[delay, 0])
-    off[0] = max(abs(now[_ACCELEROMETER] - pushed), abs(now[_ACCELEROMETER + 2] - _GRAVITY))
-    off[1] = max(abs(now[_VELOCIMETER] - ahead), abs(now[_VELOCIMETER + 1] - aside))
-    off[2] = abs(now[_GYRO + 2] - at.yaw_rate)
-    off[3] = max(abs(now[_MAGNETOMETER] - mx), abs(now[_MAGNETOMETER + 1] - my))
+    physics[0] = max(abs(now[_ACCELEROMETER] - pushed), abs(now[_ACCELEROMETER + 2] - _GRAVITY))
+    physics[1] = max(abs(now[_VELOCIMETER] - ahead), abs(now[_VELOCIMETER + 1] - aside))
+    physics[2] = abs(now[_GYRO + 2] - at.yaw_rate)
+    physics[3] = max(abs(now[_MAGNETOMETER] - mx), abs(now[_MAGNETOMETER + 1] - my))
     for sensor in range(4):
         i = 3 * sensor
-        if off[sensor] > FROZEN[sensor] and _same(before[i : i + 3], now[i : i + 3]):
-            off[sensor] = NEVER
+        if _same(before[i : i + 3], now[i : i + 3]):
+            frozen[sensor] = physics[sensor]
     for lidar in range(lidars):
         i = _LIDARS + lidar * LIDAR_BINS
         old, new = before[i : i + LIDAR_BINS], now[i : i + LIDAR_BINS]
         miss, moved = _lidar(old, new, at, _NEAR[lidar])
-        if moved > FROZEN[4 + lidar] and _same(old, new):
-            miss = NEVER
-        off[4 + lidar] = max(off[4 + lidar], miss)
+        physics[4 + lidar] = max(physics[4 + lidar], miss)
+        if _same(old, new):
+            frozen[4 + lidar] = moved
 
 
 @compiled
@@ -228,7 +231,7 @@ def surprise(now: FloatArray, normal: Any, off: FloatArray) -> None:
         normal: mean (m,) of the numbers; precision (m, m); order (m,), the numbers sensor by sensor; bounds
             (8,) or less, where in the order each sensor begins, and the end; inverse (m, m) of the
             precision's blocks on the diagonal, in that order.
-        off: (7,) receives the distances.
+        off: (7,) receives them.
     """
     mean, precision, order, bounds, inverse = normal
     m = len(mean)
@@ -259,13 +262,13 @@ def measure(
     normal: Any,
     off: FloatArray,
 ) -> None:
-    """For N observations (N, O): `compare` and `surprise`; ``off`` (N, 2, 7) receives what they find.
+    """For N observations (N, O): `compare` and `surprise`; ``off`` (N, 3, 7) receives what they find.
 
     ``robots`` is (1,) of `ROBOT`, ``memory`` (N,) of `MEMORY`, before this step.
     """
     for k in range(len(observation)):
-        compare(robots[0], delay, observation[k], memory[k].history, least, off[k, 0])
-        surprise(observation[k], normal, off[k, 1])
+        compare(robots[0], delay, observation[k], memory[k].history, least, off[k])
+        surprise(observation[k], normal, off[k, SURPRISE])
 
 
 @entry
@@ -277,7 +280,7 @@ def weigh(
     suspect: NDArray[np.int64],
     doubted: NDArray[np.bool_],
 ) -> bool:
-    """Find the largest of the distances ``off`` (N, 2, 7) in parts of their ``limits`` (2, 7).
+    """Find the largest of the distances ``off`` (N, 3, 7) in parts of their ``limits`` (3, 7).
 
     Returns whether any is above 1, or a sensor is still not trusted.
     ``novelty`` (N,) receives it, ``suspect`` (N,) whose it is, and ``doubted`` (N,) whether a sensor that the
@@ -287,10 +290,10 @@ def weigh(
     for k in range(len(off)):
         novelty[k], suspect[k] = 0.0, 0
         doubted[k] = memory[k].history.doubted > 0
-        for kind in range(2):
+        for kind in range(3):
             for sensor in range(len(limits[0])):
                 parts = off[k, kind, sensor] / limits[kind, sensor]
-                doubted[k] |= kind == 0 and parts > 1.0 and STEERED_BY[sensor]
+                doubted[k] |= kind != SURPRISE and parts > 1.0 and STEERED_BY[sensor]
                 if parts > novelty[k]:
                     novelty[k], suspect[k] = parts, sensor
         any_of_them |= doubted[k] or novelty[k] > 1.0
@@ -317,7 +320,8 @@ def remember(
             past.sensed[i] = observation[k, i]
         caught = False
         for sensor in range(len(STEERED_BY)):
-            caught |= STEERED_BY[sensor] and off[k, 0, sensor] > limits[0, sensor]
+            for kind in range(SURPRISE):
+                caught |= STEERED_BY[sensor] and off[k, kind, sensor] > limits[kind, sensor]
         if caught:
             if past.doubted == 0:
                 past.doubts = min(past.doubts + 1, 8)

@@ -26,8 +26,16 @@ from system.point_robot import ROBOT, Robot
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
-FLOORS = np.array([[0.5, 0.02, 0.5, 0.002, 0.002, 0.002, 0.002], [0.0] * 7])
-"""Least limits: of what a sensor may be off [m/s^2, m/s, rad/s, 1, m], and none of its surprise."""
+KINDS = 3
+FLOORS = np.array(
+    [
+        [0.5, 0.02, 0.5, 0.002, 0.002, 0.002, 0.002],
+        [0.01, 0.0005, 0.01, 0.0005, 0.0002, 0.0002, 0.0002],
+        [0.0] * 7,
+    ]
+)
+"""Least limits: of what a sensor may be off, of what it should have changed by though it did not [m/s^2, m/s,
+rad/s, 1, m], and none of its surprise."""
 BEYOND = 1.5
 """A limit is this times the largest that was seen."""
 HOLD = np.array([100, 500])
@@ -47,7 +55,7 @@ class Normal:
         mean: (m,) of the numbers that `consistency.numbers_of` makes of an observation.
         precision: (m, m), the inverse of their covariance.
         least: (3,) the strongest reading that a scan of each lidar shows at least.
-        limits: (2, 7) of each sensor's distance from what physics says, and of its surprise.
+        limits: (3, 7) of each sensor's distances, kind by kind, see `consistency`.
     """
 
     mean: FloatArray
@@ -69,7 +77,7 @@ class Normal:
             ValueError: if it is not such a file, naming the array that is missing or wrong.
         """
         m = count_of_numbers(observation_size)
-        shapes = {"mean": (m,), "precision": (m, m), "least": (3,), "limits": (2, 7)}
+        shapes = {"mean": (m,), "precision": (m, m), "least": (3,), "limits": (KINDS, 7)}
         try:
             with np.load(io.BytesIO(data), allow_pickle=False) as file:
                 found = {name: np.asarray(file[name]) for name in shapes}
@@ -94,7 +102,7 @@ class Findings:
         suspect: (N,) the sensors' names where it is above 1, else "".
         doubted: (N,) whether a sensor that the filter steers by is not trusted.
         any: whether one is doubted, or suspect.
-        off: (N, 2, 7) the distances.
+        off: (N, 3, 7) the distances.
     """
 
     novelty: FloatArray
@@ -122,7 +130,7 @@ class Watch:
     def look(self, observation: FloatArray, memory: Memory) -> Findings:
         """What is to be said of N observations (N, O), which are finite, given the robots' memory (N,)."""
         n = len(observation)
-        off = np.empty((n, 2, 7))
+        off = np.empty((n, KINDS, 7))
         measure(self._robot, self._delay, observation, memory, self.normal.least, self._tables, off)
         novelty, which, doubted = np.empty(n), np.empty(n, np.int64), np.empty(n, np.bool_)
         any_of_them = weigh(off, self.normal.limits, memory, novelty, which, doubted)
@@ -137,7 +145,7 @@ class Watch:
 @lru_cache(maxsize=64)
 def nothing(n: int) -> Findings:
     """What is to be said of N observations that nobody looks at."""
-    return Findings(np.full(n, np.nan), _nobody(n), np.zeros(n, np.bool_), False, np.empty((n, 2, 7)))
+    return Findings(np.full(n, np.nan), _nobody(n), np.zeros(n, np.bool_), False, np.empty((n, KINDS, 7)))
 
 
 def learn(observation: FloatArray) -> Normal:
@@ -148,7 +156,7 @@ def learn(observation: FloatArray) -> Normal:
     ridge = _RIDGE * np.maximum(np.diag(covariance), np.diag(covariance).mean()) + _LEAST_VARIANCE
     precision = np.asarray(np.linalg.inv(covariance + np.diag(ridge)), np.float64)
     mean: FloatArray = numbers.mean(axis=0)
-    return Normal(mean, precision, np.zeros(3), np.full((2, 7), np.inf))
+    return Normal(mean, precision, np.zeros(3), np.full((KINDS, 7), np.inf))
 
 
 def calibrate(normal: Normal, largest: FloatArray, least: FloatArray) -> Normal:
@@ -156,7 +164,7 @@ def calibrate(normal: Normal, largest: FloatArray, least: FloatArray) -> Normal:
 
     Args:
         normal: what was learnt.
-        largest: (2, 7) the largest distances in drives that nothing was learnt from.
+        largest: (3, 7) the largest distances in drives that nothing was learnt from.
         least: (3,) the least of their scans' strongest readings, for each lidar.
     """
     limits = np.maximum(BEYOND * largest, FLOORS)
