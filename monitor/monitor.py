@@ -176,7 +176,7 @@ class Monitor:
             ValueError: if the observation is not an array (N, O) of numbers, or the hazards or the memory are
                 not those of N robots. A fault in one row gives that robot alone the fallback.
         """
-        rows = np.array(observation, dtype=np.float64)
+        rows = np.array(observation, dtype=np.float64, order="C")
         if rows.ndim != 2:
             size = self._networks.observation_size
             raise ValueError(f"observation must have shape [N, {size}], got {rows.shape}")

@@ -53,6 +53,8 @@ class Scripted:
             risk=after["plan"][:, 0, 0] / 1000.0,
             threshold=0.5,
             opened_by=np.array(opened_by, dtype="<U7"),
+            novelty=np.zeros(len(opened_by)),
+            suspect=np.full(len(opened_by), ""),
             memory=after,
         )
 

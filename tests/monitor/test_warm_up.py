@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 SCRIPT = """
+import logging
 import sys
 import numpy as np
 from decision import MEMORY
@@ -14,14 +15,16 @@ from filter import kernel, solvers
 from guide import guide
 from inference import features, networks
 from monitor import Monitor, gate
+from novelty import consistency
 from pointgoal.lidar import encode
 
 entries = {
     name: entry
-    for room in (kernel, solvers, guide, features, networks, gate)
+    for room in (kernel, solvers, guide, features, networks, gate, consistency)
     for name, entry in vars(room).items()
     if hasattr(entry, "signatures") and entry.__module__ == room.__name__
 }
+logging.disable()
 monitor = Monitor.load(sys.argv[1], sys.argv[3], guide=sys.argv[2])
 before = {name: len(entry.signatures) for name, entry in entries.items()}
 
@@ -43,7 +46,9 @@ for n in (1, 3):
 after = {name: len(entry.signatures) for name, entry in entries.items()}
 late = {name: after[name] - before[name] for name in entries if after[name] > before[name]}
 assert not late, f"compiled on the way: {late}"
-assert monitor.faults.counts.total() == 0, monitor.faults.counts
+# What robots nowhere in particular see is novel.
+faults = {kind for kind in monitor.faults.counts if not kind.startswith("novelty: ")}
+assert not faults, faults
 """
 
 
