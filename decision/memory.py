@@ -26,8 +26,7 @@ HISTORY = np.dtype(
         ("sent", "f4", (MOST_LATE + 1, 2)),
         ("sensed", "f4", (SENSED,)),
         ("age", "i4"),
-        ("doubted", "i2"),
-        ("doubts", "i2"),
+        ("doubted", "i4"),
     ],
     align=True,
 )
@@ -36,8 +35,7 @@ HISTORY = np.dtype(
 - ``sent``: the last actions, the newest first.
 - ``sensed``: the last observation, as long as it is; zeros behind it.
 - ``age``: for how many control steps it is the last one; 0: there is none.
-- ``doubted``: for how many more control steps a sensor that the filter steers by is not trusted, and
-- ``doubts``: how often that has begun.
+- ``doubted``: 1 once a sensor that the filter steers by was caught; only a new memory trusts it again.
 """
 
 _NO_HISTORY = bytes(HISTORY.itemsize)

@@ -301,30 +301,14 @@ def weigh(
 
 
 @entry
-def remember(
-    observation: FloatArray,
-    off: FloatArray,
-    limits: FloatArray,
-    hold: NDArray[np.int64],
-    memory: NDArray[np.void],
-) -> None:
-    """Write down what was seen (N, O), and for how long a sensor is not trusted, in N robots' memory.
-
-    For the ``hold`` (2,) control steps of the first and the second time, after it was last caught; from the
-    third time on until the memory is a new one's.
-    """
+def remember(observation: FloatArray, off: FloatArray, limits: FloatArray, memory: NDArray[np.void]) -> None:
+    """Write down what was seen (N, O), and that a sensor is not trusted any more, in N robots' memory."""
     for k in range(len(observation)):
         past = memory[k].history
         past.age = 1
         for i in range(observation.shape[1]):
             past.sensed[i] = observation[k, i]
-        caught = False
-        for sensor in range(len(STEERED_BY)):
-            for kind in range(SURPRISE):
-                caught |= STEERED_BY[sensor] and off[k, kind, sensor] > limits[kind, sensor]
-        if caught:
-            if past.doubted == 0:
-                past.doubts = min(past.doubts + 1, 8)
-            past.doubted = hold[min(past.doubts, len(hold)) - 1]
-        elif past.doubted > 0 and past.doubts <= len(hold):
-            past.doubted -= 1
+        for kind in range(SURPRISE):
+            for sensor in range(len(STEERED_BY)):
+                if STEERED_BY[sensor] and off[k, kind, sensor] > limits[kind, sensor]:
+                    past.doubted = 1

@@ -38,9 +38,6 @@ FLOORS = np.array(
 rad/s, 1, m], and none of its surprise."""
 BEYOND = 1.5
 """A limit is this times the largest that was seen."""
-HOLD = np.array([100, 500])
-"""For how many control steps a sensor that was caught is not trusted: the first time 2 s, the second 10 s.
-After the third it takes somebody to say that it is in order, by a new memory."""
 _RIDGE = 1e-3
 """Added to the variances, in parts of their mean: no sensor is exact."""
 _LEAST_VARIANCE = 1e-6
@@ -139,7 +136,7 @@ class Watch:
 
     def remember(self, observation: FloatArray, findings: Findings, memory: Memory) -> None:
         """Write into N robots' memory what was seen, and what is not trusted."""
-        remember(observation, findings.off, self.normal.limits, HOLD, memory)
+        remember(observation, findings.off, self.normal.limits, memory)
 
 
 @lru_cache(maxsize=64)

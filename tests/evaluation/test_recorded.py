@@ -293,7 +293,9 @@ def test_the_closed_loops_calibration_is_checked_by_logs_of_that_loop(tmp_path: 
     part = command._episodes(config, gate, 0, 25)
     calibration = shipped.manifest.calibration.model_copy(update={"scores": tuple(sorted(part.silences))})
     manifest = shipped.manifest.model_copy(update={"calibration": calibration})
-    path = write_bundle(tmp_path / "pointgoal1", shipped.policy, shipped.multiplier, manifest, shipped.novelty).path
+    path = write_bundle(
+        tmp_path / "pointgoal1", shipped.policy, shipped.multiplier, manifest, shipped.novelty
+    ).path
 
     rows = seen(np.array, 12, 50)
     found = check_logs(asked(path, write(tmp_path / "same.npz", rows), confidence=0.95))

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from decision import MEMORY, MOST_LATE
 from novelty import GROUPS, STEERED_BY, Normal, Watch, calibrate, learn, nothing
 from novelty.consistency import NEVER, SURPRISE, count_of_numbers, numbers_of
-from novelty.watch import FLOORS, HOLD
+from novelty.watch import FLOORS
 from pointgoal.observation import layout
 from system.point_robot import Robot
 
@@ -96,7 +96,7 @@ def test_a_sensor_that_fails_is_noticed(drives, normal, sensor, fault) -> None:
     doubted = np.array([one.doubted for one in found[begins : begins + 50]])
     if sensor in STEERING:
         assert doubted.any(axis=0).mean() >= share
-        # From then on it is not trusted for a while.
+        # From then on it is not trusted.
         first = doubted.argmax(axis=0)
         for robot in np.flatnonzero(doubted.any(axis=0)):
             assert doubted[first[robot] :, robot].all()
@@ -127,7 +127,8 @@ def test_an_empty_scan_of_the_hazards_is_noticed_at_once(drives, normal) -> None
     assert (found.off[:, 0, GROUPS.index("hazards_lidar")] == NEVER).all()
 
 
-def test_it_is_trusted_again_twice_and_then_only_with_a_new_memory(drives, normal) -> None:
+def test_it_is_trusted_again_only_with_a_new_memory(drives, normal) -> None:
+    """Not because it is well again: a frozen sensor of a robot that stands looks well."""
     seen, _ = drives
     still, watch, memory = np.ascontiguousarray(seen[0, :1]), Watch(normal, Robot()), np.zeros(1, MEMORY)
     still[:, layout(1).slice("velocimeter")] = still[:, layout(1).slice("gyro")] = 0.0
@@ -141,12 +142,8 @@ def test_it_is_trusted_again_twice_and_then_only_with_a_new_memory(drives, norma
         return bool(found.doubted[0])
 
     assert not step(still)
-    for hold in HOLD:
-        assert step(wrong)
-        assert step(still)  # it jumps back
-        assert [step(still) for _ in range(hold + 1)] == [True] * hold + [False]
     assert step(wrong)
-    assert all(step(still) for _ in range(3 * int(HOLD[-1])))
+    assert all(step(still) for _ in range(2000))
     memory = np.zeros(1, MEMORY)
     assert not step(still)
 
