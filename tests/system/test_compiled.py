@@ -30,7 +30,9 @@ DECIDES = """
 import numpy as np
 from monitor import Monitor
 monitor = Monitor.load("models/pointgoal1")
-print(monitor.decide(np.zeros(60)).mode)
+observation = np.zeros(60)
+observation[28:31] = 0.15, 0.3, 0.15  # a hazard: a scan of nothing is no scan
+print(monitor.decide(observation).mode)
 """
 
 
