@@ -7,7 +7,6 @@ Every episode is a fresh layout; all run side by side in the vector environment,
 
 from __future__ import annotations
 
-import csv
 import itertools
 import time
 from collections import Counter, deque
@@ -20,6 +19,7 @@ import numpy as np
 import tyro
 from numpy.typing import NDArray
 
+from benchmarks.record import keep, kept
 from decision import MEMORY, Decisions, Origin
 from filter import BarrierFilter, FilterConfig, Robot
 from guide import DEFAULT_STRENGTH, STRENGTHS, Guide, Strength
@@ -449,22 +449,6 @@ def _row(line: Line, outcome: Outcome) -> dict[str, str]:
     }
 
 
-def _kept(path: Path) -> list[dict[str, str]]:
-    if not path.exists():
-        return []
-    with path.open(newline="", encoding="utf-8") as file:
-        return list(csv.DictReader(file))
-
-
-def _keep(path: Path, row: dict[str, str]) -> None:
-    new = not path.exists()
-    with path.open("a", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(row))
-        if new:
-            writer.writeheader()
-        writer.writerow(row)
-
-
 def table(rows: list[dict[str, str]]) -> str:
     """The lines as Markdown: what the robot did, and what the filter did of its steps."""
     head = ("policy", "world", "hazards", "gate", "guide", "return", "p10", "violating steps", "least [mm]")
@@ -484,17 +468,17 @@ def main() -> None:
     """Run the lines that are not kept yet, or print those that are."""
     arguments = tyro.cli(Arguments)
     if arguments.print:
-        print(table(_kept(arguments.out)))
+        print(table(kept(arguments.out)))
         return
     first, step = arguments.part
     for line in list(lines())[first::step]:
         asked = {name: str(value) for name, value in asdict(line).items()} | {
             "episodes": str(arguments.episodes)
         }
-        if any(all(row[name] == value for name, value in asked.items()) for row in _kept(arguments.out)):
+        if any(all(row[name] == value for name, value in asked.items()) for row in kept(arguments.out)):
             continue
         row = _row(line, run(line, arguments.episodes, arguments.seed))
-        _keep(arguments.out, row)
+        keep(arguments.out, row)
         print(" ".join(row.values()), flush=True)
 
 

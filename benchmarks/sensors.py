@@ -7,7 +7,6 @@ then, and violating steps with the gate `risk`, with `always`, and with `risk` i
 
 from __future__ import annotations
 
-import csv
 import logging
 from collections import deque
 from contextlib import closing
@@ -19,6 +18,7 @@ import numpy as np
 import tyro
 from numpy.typing import NDArray
 
+from benchmarks.record import keep, kept
 from decision import MEMORY, Decisions
 from models import Bundle
 from monitor import GateName, Monitor
@@ -175,19 +175,14 @@ def main() -> None:
     """Run the lines that are not kept yet."""
     logging.getLogger("lagnet.monitor").setLevel(logging.ERROR)
     arguments = tyro.cli(Arguments)
-    kept = list(csv.DictReader(arguments.out.open(encoding="utf-8"))) if arguments.out.exists() else []
+    known = kept(arguments.out)
     for sensor in arguments.sensors:
         for fault in arguments.faults:
             asked = (sensor, fault, arguments.hazards, str(arguments.episodes))
-            if any((row["sensor"], row["fault"], row["hazards"], row["episodes"]) == asked for row in kept):
+            if any((row["sensor"], row["fault"], row["hazards"], row["episodes"]) == asked for row in known):
                 continue
             row = line(arguments, sensor, fault)
-            new = not arguments.out.exists()
-            with arguments.out.open("a", newline="", encoding="utf-8") as file:
-                writer = csv.DictWriter(file, list(row))
-                if new:
-                    writer.writeheader()
-                writer.writerow(row)
+            keep(arguments.out, row)
             print(" ".join(row.values()), flush=True)
 
 

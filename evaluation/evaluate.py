@@ -110,11 +110,8 @@ def _decider(config: EvaluateConfig, bundle: Bundle) -> Iterator[tuple[BatchDeci
     """What decides, and how it calls itself: model, gate, threshold, guide."""
     if config.url is None:
         guide = config.guide or DEFAULT_STRENGTH
-        monitor = Monitor.load(config.bundle, config.gate or "risk", config.threshold, guide=guide)
-        gate = monitor.gate
-        if not config.floor:
-            gate = replace(gate, floor=False)
-            monitor = Monitor.load(config.bundle, gate, guide=guide)
+        monitor = Monitor.load(bundle, config.gate or "risk", config.threshold, guide=guide)
+        gate = monitor.gate = replace(monitor.gate, floor=config.floor)
         yield monitor, {"model": bundle.id, "gate": gate.name, "threshold": gate.threshold, "guide": guide}
         return
     if not config.floor:

@@ -18,7 +18,7 @@ from monitor import Monitor
 from novelty import FLOORS, Normal, Watch, calibrate, learn
 from pointgoal import seeds
 from pointgoal.loop import SIDE_BY_SIDE, drive, groups, side_by_side
-from pointgoal.observation import LIDAR_BINS
+from pointgoal.observation import LIDAR_BINS, layout
 from pointgoal.scene import STEP_SECONDS
 from pointgoal.seeds import Use
 from pointgoal.simulation import EPISODE_STEPS
@@ -94,6 +94,7 @@ def look_around(
     """Drives one episode for each row, in the closed loop, and measures what is seen; no limit is applied."""
     unlimited = replace(normal, limits=np.full(FLOORS.shape, np.inf), least=np.zeros(3))
     watch = Watch(unlimited, monitor.robot)
+    lidars = layout(monitor.bundle.manifest.level).slice("goal_lidar").start
     seen = Seen([], np.zeros(FLOORS.shape), np.ones(3))
     level, size = monitor.bundle.manifest.level, side_by_side(len(rows), SIDE_BY_SIDE)
     with closing(PointGoalVectorEnv(level=level, num_envs=size, num_threads=1)) as env:
@@ -113,7 +114,7 @@ def look_around(
             for t, step in enumerate(drive(env, act, rows[part])):
                 if t % _EVERY == 0:
                     seen.observations.append(step.observation.copy())
-                scans = step.observation[:, 12:].reshape(size, -1, LIDAR_BINS).max(axis=2).min(axis=0)
+                scans = step.observation[:, lidars:].reshape(size, -1, LIDAR_BINS).max(axis=2).min(axis=0)
                 seen.least[: len(scans)] = np.minimum(seen.least[: len(scans)], scans)
             done(part.stop - part.start)
     return seen

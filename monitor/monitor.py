@@ -210,7 +210,8 @@ class Monitor:
             raise FilterInputError("observation", f"must have {size} numbers, got {observation.shape[1:]}")
         scene = self._filter.look(observation, hazards, memory)
         found = self._watch.look(observation, memory) if self._watch is not None else nothing(len(scene))
-        if found.any and self.gate.name != "off":
+        acts = found.any and self.gate.name != "off"
+        if acts:
             scene.doubt(found.doubted)
         nominal, risk = self._networks.run(observation)
         if nominal.shape != (len(observation), 2) or risk.shape != nominal.shape[:1]:
@@ -231,7 +232,7 @@ class Monitor:
         decided = self._filter.decide(scene, asked, memory, active)
         if decided.action is not asked or decided.mode.shape != active.shape:
             decided.check(asked, active, self._low, self._high)
-        if found.any and self.gate.name != "off":
+        if acts:
             decided = _say_why(decided, found)
         if not all_sound:
             decided = self._planned(

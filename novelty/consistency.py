@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from decision import MOST_LATE
 from pointgoal.observation import BIN_WIDTH, LIDAR_BINS, LIDAR_RANGE, layout
 from system.compiled import compiled, entry
+from system.lidar import place_alone
 from system.point_robot import Robot, State, once_arrived
 from system.surroundings import in_own_frame
 
@@ -51,18 +52,8 @@ def _alone(readings: Readings, b: int) -> tuple[bool, float, float]:
     before, after = readings[(b + LIDAR_BINS - 1) % LIDAR_BINS], readings[(b + 1) % LIDAR_BINS]
     if reading <= 0.0 or reading > 1.0 or abs(before + after - reading) > _ALONE:
         return False, 0.0, 0.0
-    bearing = (b + after / reading) * BIN_WIDTH
-    distance = LIDAR_RANGE * (1.0 - reading)
-    return True, distance * math.cos(bearing), distance * math.sin(bearing)
-
-
-@compiled
-def _strongest(readings: Readings) -> int:
-    best = 0
-    for b in range(1, LIDAR_BINS):
-        if readings[b] > readings[best]:
-            best = b
-    return best
+    x, y = place_alone(readings, b)
+    return True, x, y
 
 
 @compiled
@@ -97,7 +88,7 @@ def _lidar(before: Readings, now: Readings, at: State, near: float) -> tuple[flo
     ``at`` is where the robot is now, from where it was; things nearer than ``near`` [m] are not looked at.
     """
     moved = math.hypot(at.x, at.y)
-    was, most = np.float64(before[_strongest(before)]), np.float64(now[_strongest(now)])
+    was, most = np.float64(before.max()), np.float64(now.max())
     off = 0.0
     for i in range(LIDAR_BINS):
         off = max(off, -LIDAR_RANGE * now[i], LIDAR_RANGE * (now[i] - 1.0))
@@ -290,7 +281,7 @@ def weigh(
     for k in range(len(off)):
         novelty[k], suspect[k] = 0.0, 0
         doubted[k] = memory[k].history.doubted > 0
-        for kind in range(3):
+        for kind in range(len(limits)):
             for sensor in range(len(limits[0])):
                 parts = off[k, kind, sensor] / limits[kind, sensor]
                 doubted[k] |= kind != SURPRISE and parts > 1.0 and STEERED_BY[sensor]
@@ -301,14 +292,11 @@ def weigh(
 
 
 @entry
-def remember(observation: FloatArray, off: FloatArray, limits: FloatArray, memory: NDArray[np.void]) -> None:
-    """Write down what was seen (N, O), and that a sensor is not trusted any more, in N robots' memory."""
+def remember(observation: FloatArray, doubted: NDArray[np.bool_], memory: NDArray[np.void]) -> None:
+    """Write down what was seen (N, O), and who is not trusted any more (N,), in N robots' memory."""
     for k in range(len(observation)):
         past = memory[k].history
         past.age = 1
+        past.doubted = doubted[k]
         for i in range(observation.shape[1]):
             past.sensed[i] = observation[k, i]
-        for kind in range(SURPRISE):
-            for sensor in range(len(STEERED_BY)):
-                if STEERED_BY[sensor] and off[k, kind, sensor] > limits[kind, sensor]:
-                    past.doubted = 1

@@ -26,7 +26,6 @@ from system.point_robot import ROBOT, Robot
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
-KINDS = 3
 FLOORS = np.array(
     [
         [0.5, 0.02, 0.5, 0.002, 0.002, 0.002, 0.002],
@@ -36,6 +35,7 @@ FLOORS = np.array(
 )
 """Least limits: of what a sensor may be off, of what it should have changed by though it did not [m/s^2, m/s,
 rad/s, 1, m], and none of its surprise."""
+KINDS = len(FLOORS)
 BEYOND = 1.5
 """A limit is this times the largest that was seen."""
 _RIDGE = 1e-3
@@ -136,7 +136,7 @@ class Watch:
 
     def remember(self, observation: FloatArray, findings: Findings, memory: Memory) -> None:
         """Write into N robots' memory what was seen, and what is not trusted."""
-        remember(observation, findings.off, self.normal.limits, memory)
+        remember(observation, findings.doubted, memory)
 
 
 @lru_cache(maxsize=64)

@@ -14,6 +14,7 @@ every hazard within the lidar's range, aliasing and hazards that share a bin inc
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -203,6 +204,15 @@ def _cover(
 
 
 @compiled
+def place_alone(readings: NDArray[np.floating[Any]], b: int) -> tuple[float, float]:
+    """Where a thing is that is alone in bin b of a scan (16,), whose reading is above 0: x, y [m]."""
+    reading = np.float64(readings[b])
+    bearing = (b + readings[(b + 1) % LIDAR_BINS] / reading) * BIN_WIDTH
+    distance = LIDAR_RANGE * (1.0 - reading)
+    return distance * math.cos(bearing), distance * math.sin(bearing)
+
+
+@compiled
 def decode_goal(readings: FloatArray) -> tuple[bool, float, float]:
     """Where the goal is, which is alone in its lidar: whether it is in range, and its place x, y [m]."""
     best = 0
@@ -212,9 +222,8 @@ def decode_goal(readings: FloatArray) -> tuple[bool, float, float]:
     strongest = readings[best]
     if strongest <= 0.0:
         return False, 0.0, 0.0
-    bearing = (best + readings[(best + 1) % LIDAR_BINS] / strongest) * BIN_WIDTH
-    distance = LIDAR_RANGE * (1.0 - strongest)
-    return True, distance * math.cos(bearing), distance * math.sin(bearing)
+    x, y = place_alone(readings, best)
+    return True, x, y
 
 
 @compiled
