@@ -12,6 +12,7 @@ from monitor import Monitor
 from recorder import Recorder
 from server.desk import Desk
 from server.guard import ACT, BATCH, Guard
+from server.observer import Observer, Recording
 from server.schema import MAX_ROBOTS, ActReply, ActRequest, BatchReply, ModelReply
 
 MAX_BODY = 65536
@@ -92,7 +93,8 @@ def create_app(
             return JSONResponse({"status": "degraded", "internal_faults": faults}, status_code=503)
         return JSONResponse({"status": "ready"})
 
-    return Guard(Desk(app, monitor, model, recorder), api_key, max_body, {BATCH: BATCH_BODY * max_body})
+    observers: list[Observer] = [] if recorder is None else [Recording(recorder)]
+    return Guard(Desk(app, monitor, model, observers), api_key, max_body, {BATCH: BATCH_BODY * max_body})
 
 
 def _act_schema(model: ModelReply) -> dict[str, Any]:

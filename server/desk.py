@@ -5,11 +5,11 @@ from __future__ import annotations
 import asyncio
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,22 +20,30 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from decision import MEMORY, Decision, Memory, memory_from_json
 from monitor import Monitor
-from recorder import Recorder
 from server.guard import ACT, AT_ONCE, BATCH, BodyTooLargeError
+from server.observer import Answered, Observer
 from server.schema import ActRequest, BatchReply, BatchRequest, ModelReply, Refusal, Reply, reply_of
 
 FloatArray = NDArray[np.float64]
 
 _MAX_ERRORS = 8
-_RECORDED = (200, 500)
-"""The statuses of decisions, and of those that could not be told."""
 _QUICK = 0.005
 """A decision within this time is made at once [s]: a health check may wait for it."""
 _QUICK_ENOUGH = 20
 """So many quick ones in a row, and the next is expected to be quick."""
 
-Answer = tuple[int, bytes]
-"""Status and body."""
+
+class Answer(NamedTuple):
+    """What is answered, and about whom was decided."""
+
+    status: int
+    body: bytes
+    asked: Sequence[ActRequest] = ()
+    """The requests that were decided about, in order."""
+    decisions: Sequence[Decision] = ()
+    """What was decided about each."""
+
+
 Problem = tuple[list[str | int], str, str]
 """Where in the body, what is wrong, and its kind."""
 Validated = TypeVar("Validated", bound=BaseModel)
@@ -64,16 +72,16 @@ class Desk:
         app: what answers the other paths.
         monitor: what decides.
         model: what it told of itself.
-        recorder: what records the decisions, if any does.
+        observers: told of every answer, in order.
     """
 
     def __init__(
-        self, app: ASGIApp, monitor: Monitor, model: ModelReply, recorder: Recorder | None = None
+        self, app: ASGIApp, monitor: Monitor, model: ModelReply, observers: Sequence[Observer] = ()
     ) -> None:
         self._app = app
         self._monitor = monitor
         self._model = model
-        self._recorder = recorder
+        self._observers = observers
         self._thread = ThreadPoolExecutor(1, "decisions")
         self._quick = 0
         self._answers = {ACT: self._one, BATCH: self._batch}
@@ -85,20 +93,25 @@ class Desk:
             await self._app(scope, receive, send)
             return
         started = time.perf_counter()
+        content = b""
+        received = time.time_ns()
         try:
             content = await _body(receive)
-        except BodyTooLargeError as error:
-            status, answer = _problem(413, [([], str(error), "too_large")])
-        else:
             received = time.time_ns()
             if self._quick >= _QUICK_ENOUGH and scope["path"] == ACT:
-                status, answer = answers(content, started)
+                answer = answers(content, started)
             else:
                 loop = asyncio.get_running_loop()
-                status, answer = await loop.run_in_executor(self._thread, answers, content, started)
-            if self._recorder is not None and status in _RECORDED:
-                self._recorder.record(received, scope.get("client"), status, content, answer)
-        await _reply(scope, send, status, answer)
+                answer = await loop.run_in_executor(self._thread, answers, content, started)
+        except BodyTooLargeError as error:
+            answer = _problem(413, [([], str(error), "too_large")])
+        if self._observers:
+            seconds = time.perf_counter() - started
+            client = scope.get("client")
+            answered = Answered(received, client, scope["path"], content, seconds, *answer)
+            for observer in self._observers:
+                observer.answered(answered)
+        await _reply(scope, send, answer.status, answer.body)
 
     def answer(self, content: bytes, batch: bool) -> Answer:
         """The answer to the body of a `POST /act`, or of a `POST /act/batch`."""
@@ -115,24 +128,28 @@ class Desk:
         """Answers the body of `POST /act/batch`."""
         return self._guarded(lambda: self._decide_batch(content, started))
 
-    def _guarded(self, decide: Callable[[], BaseModel]) -> Answer:
+    def _guarded(self, decide: Callable[[], tuple[BaseModel, list[ActRequest], list[Decision]]]) -> Answer:
         try:
-            return 200, decide().model_dump_json().encode()
+            reply, asked, decisions = decide()
+            return Answer(200, reply.model_dump_json().encode(), asked, decisions)
         except RefusedError as error:
             return _problem(422, error.errors)
         except Exception as error:  # noqa: BLE001 - counted and logged; the client has a fallback of its own
             self._monitor.faults.note(type(error).__name__, "the decision could not be told", error)
             return _problem(500, [([], "internal error", "internal")])
 
-    def _decide(self, content: bytes, started: float) -> Reply:
+    def _decide(self, content: bytes, started: float) -> tuple[BaseModel, list[ActRequest], list[Decision]]:
         asked, memory = self._read(lambda: ActRequest.model_validate_json(content))
         decision = self._monitor.decide(asked.observation, asked.hazards, memory)
-        return self._told(decision, asked, started)
+        return self._told(decision, asked, started), [asked], [decision]
 
-    def _decide_batch(self, content: bytes, started: float) -> BaseModel:
+    def _decide_batch(
+        self, content: bytes, started: float
+    ) -> tuple[BaseModel, list[ActRequest], list[Decision]]:
         """One call of the monitor for all robots whose requests are in order; the others are told why not."""
         replies: list[Reply | Refusal] = []
         rows: list[tuple[int, ActRequest, Memory | None]] = []
+        told: list[Decision] = []
         batch = _validated(lambda: BatchRequest.model_validate(_parsed(content)))
         for place, robot in enumerate(batch.robots):
             try:
@@ -150,8 +167,8 @@ class Desk:
             for row, (place, asked, _) in enumerate(rows):
                 decision = _of_its_own(decisions[row], len(asked.hazards or []), most)
                 replies[place] = self._told(decision, asked, started)
-        reply: BaseModel = BatchReply(replies=replies)
-        return reply
+                told.append(decision)
+        return BatchReply(replies=replies), [asked for _, asked, _ in rows], told
 
     def _read(self, validate: Callable[[], ActRequest]) -> tuple[ActRequest, Memory | None]:
         """One robot's request, and its memory.
@@ -234,7 +251,7 @@ async def _reply(scope: Scope, send: Send, status: int, content: bytes) -> None:
 
 def _problem(status: int, errors: list[Problem]) -> Answer:
     """An error in FastAPI's form."""
-    return status, json.dumps({"detail": _detail(errors)}).encode()
+    return Answer(status, json.dumps({"detail": _detail(errors)}).encode())
 
 
 def _detail(errors: list[Problem]) -> list[dict[str, Any]]:

@@ -113,7 +113,7 @@ class Again:
             seconds: when that was, to be said where they differ.
         """
         batch = b'"robots"' in recorded.request and "robots" in from_json(recorded.request)
-        _, answer = self._desk.answer(recorded.request, batch)
+        answer = self._desk.answer(recorded.request, batch).body
         then, now = _decisions(recorded.reply), _decisions(answer)
         numbers = [decision["robot"] for decision in recorded.decisions]
         for place in range(max(len(then), len(now))):

@@ -26,6 +26,7 @@ Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 """A JSON number; not a string, not a bool, not NaN or Inf in any spelling."""
 Pair = Annotated[list[Finite], Field(min_length=2, max_length=2)]
 RequestNumber = Annotated[int, Field(strict=True, ge=0, lt=2**63)]
+RobotName = Annotated[str, Field(strict=True, pattern=r"^[A-Za-z0-9_.:-]{1,64}$")]
 MAX_HAZARDS = 1000
 """Most hazards a request may name."""
 MAX_ROBOTS = 256
@@ -64,6 +65,8 @@ class ActRequest(BaseModel):
             decoded.
         memory: the `memory` of this robot's last reply, unchanged; left out before its first step.
         request: any whole number; the reply repeats it, so that its sender knows which request it answers.
+        robot: the robot's name, by which the service tells robots apart whichever way they come; at most 64
+            letters, digits and "_.:-".
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -72,6 +75,7 @@ class ActRequest(BaseModel):
     hazards: Annotated[list[Pair], Field(max_length=MAX_HAZARDS)] | None = None
     memory: MemoryJson | None = None
     request: RequestNumber = 0
+    robot: RobotName | None = None
 
 
 class Reply(BaseModel):
