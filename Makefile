@@ -2,6 +2,8 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 BUNDLE ?= models/pointgoal1
+# A worker a core, and a file's tests in one worker: they share what is slow to start.
+PARALLEL ?= --numprocesses=logical --maxprocesses=4 --dist=loadfile
 
 .PHONY: help setup demo test test-long lint format benchmark clean
 
@@ -23,7 +25,7 @@ demo: setup ## the robot in MuJoCo, driven through POST /act, with and without t
 	$(BIN)/python -m evaluation.demo $(BUNDLE) --out demo
 
 test: setup ## the test suite
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest $(PARALLEL)
 
 test-long: setup ## the tests that take longer
 	$(BIN)/python -m pytest -m long
