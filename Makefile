@@ -28,7 +28,7 @@ test: setup ## the test suite
 	$(BIN)/python -m pytest $(PARALLEL)
 
 test-long: setup ## the tests that take longer
-	$(BIN)/python -m pytest -m long
+	$(BIN)/python -m pytest -m long $(PARALLEL)
 
 lint: setup ## ruff and mypy, as CI runs them
 	$(BIN)/ruff check .

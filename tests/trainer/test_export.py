@@ -103,7 +103,8 @@ def test_the_graphs_are_exact_for_a_policy_that_reacts_steeply(run):
         trained.learner.actor.mul_(12)
     double, differences = export.graphs(trained, observation)
     assert onnx.TensorProto.DOUBLE in types(double[0])
-    assert differences["onnx_difference_action"] < 1e-6
+    # Of what is drawn; on the way out of the dead zone what is sent moves farther.
+    assert differences["onnx_difference_action"] < 1e-6 * trained.range.gain.max()
 
 
 def types(graph: bytes) -> set[int]:
