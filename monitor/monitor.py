@@ -185,6 +185,10 @@ class Monitor:
             raise ValueError(f"hazards must have shape [{len(rows)}, n, 2], got {given.shape}")
         return self._decide_or_fall_back(rows, given, memory_of(len(rows), memory))
 
+    def look(self, observation: FloatArray, hazards: FloatArray | None, memory: Memory) -> Scene:
+        """What N robots see, and nothing decided; arguments and errors as `filter.BarrierFilter.look`."""
+        return self._filter.look(observation, hazards, memory)
+
     def _decide_or_fall_back(
         self, observation: FloatArray, hazards: FloatArray | None, memory: Memory, lost: str | None = None
     ) -> Decisions:

@@ -1,19 +1,24 @@
-"""The HTTP service: `POST /act`, `POST /act/batch`, `/model`, `/healthz`, `/readyz`."""
+"""The HTTP service: `POST /act`, `POST /act/batch`, `/model`, `/healthz`, `/readyz`, and the live page at `/`."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Any
 
 from fastapi import FastAPI
 from fastapi.responses import JSONResponse
 
+from filter import FilterConfig
 from monitor import Monitor
 from recorder import Recorder
 from server.desk import Desk
 from server.guard import ACT, BATCH, Guard
+from server.live import Hub, Operation
 from server.observer import Observer, Recording
 from server.schema import MAX_ROBOTS, ActReply, ActRequest, BatchReply, ModelReply
+from server.static import routes
+from server.view import Views
 
 MAX_BODY = 65536
 """Most bytes of a request's body: 60 numbers and a thousand hazards fit."""
@@ -35,9 +40,31 @@ class Lifecycle:
 
     Attributes:
         draining: it is about to stop: /readyz says 503, requests are still answered.
+        at_end: called once it accepts no more connections: they end what would go on for ever.
     """
 
     draining: bool = False
+    at_end: list[Callable[[], None]] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Standing:
+    """An `Operation` that knows no alarms.
+
+    Attributes:
+        lifecycle: whether it drains.
+        monitor: whether it has faults.
+    """
+
+    lifecycle: Lifecycle
+    monitor: Monitor
+
+    def snapshot(self) -> dict[str, Any]:
+        """What the page shows."""
+        degraded = self.monitor.faults.internal() >= MANY_FAULTS
+        state = "draining" if self.lifecycle.draining else "degraded" if degraded else "ready"
+        counters = dict(self.monitor.faults.counts)
+        return {"state": state, "alarms": [], "counters": counters, "model": self.monitor.bundle.id}
 
 
 def create_app(
@@ -46,6 +73,8 @@ def create_app(
     api_key: str | None = None,
     max_body: int = MAX_BODY,
     recorder: Recorder | None = None,
+    filter_config: FilterConfig | None = None,
+    operation: Operation | None = None,
 ) -> Guard:
     """The service around one monitor that is loaded and warmed up.
 
@@ -55,6 +84,8 @@ def create_app(
         api_key: the key that every request but the health checks must carry; None asks for none.
         max_body: most bytes of a request's body; a batch's may be `BATCH_BODY` times as large.
         recorder: what records the decisions, if any does.
+        filter_config: the filter's settings; None: the defaults.
+        operation: tells the page where the service stands; None: the life cycle and the faults alone.
     """
     state = lifecycle or Lifecycle()
     model = ModelReply.of(monitor)
@@ -93,7 +124,13 @@ def create_app(
             return JSONResponse({"status": "degraded", "internal_faults": faults}, status_code=503)
         return JSONResponse({"status": "ready"})
 
-    observers: list[Observer] = [] if recorder is None else [Recording(recorder)]
+    views = Views(monitor, filter_config or FilterConfig())
+    about = model.model_dump(include={"model", "task", "gate", "threshold", "guide"})
+    about["full_thrust"] = monitor.robot.force_limit
+    hub = Hub(views, operation or Standing(state, monitor), about)
+    state.at_end.append(hub.close)
+    app.router.routes.extend(routes(hub))
+    observers: list[Observer] = [hub] if recorder is None else [hub, Recording(recorder)]
     return Guard(Desk(app, monitor, model, observers), api_key, max_body, {BATCH: BATCH_BODY * max_body})
 
 

@@ -12,8 +12,10 @@ from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 ACT, BATCH = "/act", "/act/batch"
-OPEN_PATHS = frozenset({"/healthz", "/readyz"})
-"""What an orchestrator may ask without a key."""
+HOME, PAGE = "/", "/page/"
+"""The live page, and what its files' paths begin with: they hold no secret and need no key."""
+OPEN_PATHS = frozenset({"/healthz", "/readyz", HOME})
+"""What an orchestrator, and a browser that was not told the key yet, may ask without one."""
 AT_ONCE = "lagnet.at_once"
 """The ASGI extension by which the server takes status and body of a JSON reply at once: True if it did."""
 FULL = "lagnet.full"
@@ -50,7 +52,8 @@ class Guard:
             await self._app(scope, receive, send)
             return
         headers: dict[bytes, bytes] = dict(scope["headers"])
-        if scope["path"] not in OPEN_PATHS and not self._admits(headers):
+        is_open = scope["path"] in OPEN_PATHS or scope["path"].startswith(PAGE)
+        if not is_open and not self._admits(headers):
             await _refuse(send, 401, "header", "authorization", "a valid API key is required")
             return
         if scope["path"] in (ACT, BATCH) and scope.get("extensions", {}).get(FULL):
