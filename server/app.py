@@ -1,4 +1,4 @@
-"""The HTTP service: `POST /act`, `POST /act/batch`, `/model`, `/healthz`, `/readyz`, and the live page at `/`."""
+"""The HTTP service: `POST /act`, `POST /act/batch`, `/model`, `/healthz`, `/readyz`, and a page at `/`."""
 
 from __future__ import annotations
 
@@ -125,9 +125,9 @@ def create_app(
         return JSONResponse({"status": "ready"})
 
     views = Views(monitor, filter_config or FilterConfig())
-    about = model.model_dump(include={"model", "task", "gate", "threshold", "guide"})
-    about["full_thrust"] = monitor.robot.force_limit
-    hub = Hub(views, operation or Standing(state, monitor), about)
+    facts = model.model_dump(include={"model", "task", "gate", "threshold", "guide"})
+    facts["full_thrust"] = monitor.robot.force_limit
+    hub = Hub(views, operation or Standing(state, monitor), facts)
     state.at_end.append(hub.close)
     app.router.routes.extend(routes(hub))
     observers: list[Observer] = [hub] if recorder is None else [hub, Recording(recorder)]

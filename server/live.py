@@ -88,12 +88,11 @@ class Robot:
             self.worst = decision
         self.asked, self.decision, self.seconds, self.heard = asked, decision, seconds, heard
         self.steps += 1
-        if seconds > self.slowest:
-            self.slowest = seconds
+        self.slowest = max(self.slowest, seconds)
         # A NaN is above and below everything, and stays.
-        if not decision.risk <= self.peak and self.peak == self.peak:  # noqa: PLR0124 - NaN alone is not
+        if not decision.risk <= self.peak and self.peak == self.peak:
             self.peak = decision.risk
-        if not decision.barrier >= self.least and self.least == self.least:  # noqa: PLR0124
+        if not decision.barrier >= self.least and self.least == self.least:
             self.least = decision.barrier
 
     def told(self, now: float) -> dict[str, Any]:

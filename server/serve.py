@@ -287,9 +287,7 @@ def serve(config: ServeConfig) -> None:
         gate = {"gate": monitor.gate.name, "threshold": monitor.gate.threshold, "guide": config.guide}
         announcement = json.dumps(ready | gate)
         with recorder_of(config, monitor) as recorder:
-            app = create_app(
-                monitor, lifecycle, api_key, config.max_body, recorder, config.filter_config()
-            )
+            app = create_app(monitor, lifecycle, api_key, config.max_body, recorder, config.filter_config())
             # What is loaded stays: looking through it again and again for garbage would hold up decisions.
             gc.collect()
             gc.freeze()

@@ -82,12 +82,13 @@ class Views:
         count = int(seen["count"])
         motion = np.array([seen["vx"], seen["vy"], seen["yaw_rate"]])
         nearest = np.argsort(np.hypot(*given.T), kind="stable")[:MOST_HAZARDS]
-        reach, bearing = goal(self._block(observation, "goal_lidar")), _heading(self._magnetic(observation))
+        heading = _heading(self._block(observation, "magnetometer"))
+        in_range, *place = goal(self._block(observation, "goal_lidar"))
         return {
-            "heading": None if bearing is None else bearing + at[2],
+            "heading": None if heading is None else heading + at[2],
             "velocity": _rounded(motion[:2]),
             "yaw_rate": _rounded(motion[2]),
-            "goal": _rounded(_own(np.array([reach[1:]]), at))[0] if reach[0] else None,
+            "goal": _rounded(_own(np.array([place]), at))[0] if in_range else None,
             "radius": self._radius,
             "given": _numbered(_own(given[nearest], at), nearest),
             "likely": _numbered(*self._of_scan(scene.readings[0], given, at)),
@@ -119,10 +120,8 @@ class Views:
         return [[0.0, 0.0], *_rounded(self._way[(count - 1) % _SPARSE : count : _SPARSE])]
 
     def _block(self, observation: FloatArray, name: str) -> FloatArray:
-        return observation[self._layout.slice(name)]
-
-    def _magnetic(self, observation: FloatArray) -> FloatArray:
-        return self._block(observation, "magnetometer")
+        block: FloatArray = observation[self._layout.slice(name)]
+        return block
 
 
 def _heading(field: FloatArray) -> float | None:
@@ -134,7 +133,8 @@ def _heading(field: FloatArray) -> float | None:
 def _own(places: FloatArray, at: tuple[float, float, float]) -> FloatArray:
     """Places (n, 2) as a robot has them that is at (x, y, heading)."""
     cos, sin = math.cos(at[2]), math.sin(at[2])
-    return (places - at[:2]) @ np.array([[cos, -sin], [sin, cos]])
+    own: FloatArray = (places - at[:2]) @ np.array([[cos, -sin], [sin, cos]])
+    return own
 
 
 def _numbered(rows: FloatArray, numbers: ArrayLike) -> list[list[float]]:

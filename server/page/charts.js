@@ -2,11 +2,10 @@
 
 import uPlot from "./uplot/uPlot.esm.js";
 import { MINUTE } from "./history.js";
-import { palette } from "./palette.js";
+import { font, palette } from "./palette.js";
 
 const LEFT = 46; // width of the vertical axes: the charts stand in line
 const RIGHT = 12;
-const FONT = "12px system-ui, sans-serif";
 const MODES = ["nominal", "guided", "filtered", "fallback"];
 
 let now = 0;
@@ -18,13 +17,13 @@ export class Charts {
   /** @param places  name → element for risk, barrier, modes and latency. */
   constructor(places) {
     this.#charts = {
-      risk: chart(places.risk, 124, [line("risk", 2), line("muted", 1.5, [6, 4])], { y: (u, low, high) => [0, 1.25 * Math.max(high || 0, 1e-3)] }),
-      barrier: chart(places.barrier, 104, [line("velocity", 2)], {
-        y: (u, low, high) => [Math.min(low ?? 0, 0) - 0.05, Math.max(high ?? 0, 0.2) * 1.1],
+      risk: chart(places.risk, 112, [line("risk", 2), line("muted", 1.5, [6, 4])], { y: (u, low, high) => [0, 1.25 * Math.max(high || 0, 1e-3)] }),
+      barrier: chart(places.barrier, 92, [line("velocity", 2)], {
+        y: (u, low, high) => [Math.min(low ?? 0, 0) - 0.05, Math.min(Math.max(1.1 * (high ?? 0), 0.2), 1)],
         zero: true,
       }),
-      modes: chart(places.modes, 62, [{ show: false }], { y: () => [0, 1], draw: ribbon, bare: true }),
-      latency: chart(places.latency, 104, [line("ink", 1.5)], { y: (u, low, high) => [0, 1.25 * Math.max(high || 0, 1)], times: true }),
+      modes: chart(places.modes, 66, [{ show: false }], { y: () => [0, 1], draw: ribbon, bare: true }),
+      latency: chart(places.latency, 92, [line("ink", 1.5)], { y: (u, low, high) => [0, 1.25 * Math.max(high || 0, 1)], times: true }),
     };
     const resize = new ResizeObserver((entries) => {
       for (const { target, contentRect } of entries) {
@@ -63,10 +62,10 @@ function chart(place, height, series, { y, draw, bare = false, zero = false, tim
     axes: [
       {
         show: true,
-        size: times ? 24 : 0,
+        size: times ? 28 : 0,
         stroke: () => palette.muted,
-        font: FONT,
-        gap: 4,
+        font: font(12),
+        gap: 8,
         grid: { stroke: () => palette.line, width: 1 },
         ticks: { show: false },
         splits: () => [-60, -45, -30, -15, 0].map((s) => now + s),
@@ -75,7 +74,7 @@ function chart(place, height, series, { y, draw, bare = false, zero = false, tim
       {
         size: LEFT,
         stroke: () => palette.muted,
-        font: FONT,
+        font: font(12),
         gap: 6,
         grid: { show: !bare, stroke: () => palette.line, width: 1 },
         ticks: { show: false },
@@ -112,8 +111,8 @@ function ribbon(u) {
   ctx.beginPath();
   ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height);
   ctx.clip();
-  const strip = Math.round(0.14 * bbox.height);
-  const base = bbox.top + bbox.height - strip - Math.round(0.06 * bbox.height);
+  const strip = Math.round(0.24 * bbox.height);
+  const base = bbox.top + bbox.height - strip - Math.round(0.05 * bbox.height);
   const tall = base - bbox.top;
   runs(history.at, history.mode, (from, to, mode) => {
     const [x, width] = span(u, from, to);
@@ -121,10 +120,17 @@ function ribbon(u) {
     ctx.fillStyle = palette[MODES[mode]];
     ctx.fillRect(x, base - height, width, height);
   });
-  runs(history.at, history.cause.map((cause) => (cause === null ? null : 1)), (from, to) => {
+  ctx.font = font(Math.round(0.72 * strip));
+  ctx.textBaseline = "middle";
+  ctx.textAlign = "center";
+  runs(history.at, history.cause, (from, to, cause) => {
     const [x, width] = span(u, from, to);
-    ctx.fillStyle = palette.gate;
-    ctx.fillRect(x, bbox.top + bbox.height - strip, width, strip);
+    const y = bbox.top + bbox.height - strip;
+    ctx.fillStyle = palette[`by-${cause}`];
+    ctx.fillRect(x, y, width, strip);
+    if (ctx.measureText(cause).width + 6 > width) return;
+    ctx.fillStyle = palette.panel;
+    ctx.fillText(cause, x + width / 2, y + strip / 2);
   });
   ctx.restore();
 }

@@ -101,6 +101,7 @@ function makeCard(name) {
   const note = make("span", "note");
   card.append(radio, title, mode, meter, note);
   element("robots").append(card);
+  if (name === chosen) card.scrollIntoView({ block: "nearest", inline: "nearest" });
   return { card, radio, mode, bar, note };
 }
 
@@ -121,7 +122,7 @@ function showCard(robot, name, age) {
   const share = row.risk === null || !row.threshold ? 0 : Math.min(row.risk / row.threshold / 2, 1);
   parts.bar.style.width = `${100 * share}%`;
   parts.bar.dataset.over = share > 0.5;
-  parts.note.textContent = stale ? `silent for ${ageInWords(age)}` : `λ ${known(row.risk, 3)}, barrier ${known(row.barrier, 2, "m")}`;
+  parts.note.textContent = stale ? `silent for ${ageInWords(age)}` : `λ ${known(row.risk, 3)}, barrier ${known(row.barrier, 3, "m")}`;
 }
 
 // --- the robot that is looked at ------------------------------------------------------------------------
@@ -142,8 +143,6 @@ const READINGS = [
   ["yaw", "Yaw rate"],
   ["latency", "Latency"],
   ["rate", "Decisions"],
-  ["nominal", "Nominal action"],
-  ["sent", "Sent action"],
 ];
 const readings = Object.fromEntries(
   READINGS.map(([key, title]) => {
@@ -155,30 +154,33 @@ const readings = Object.fromEntries(
   }),
 );
 
-let described = 0;
+/** What the robot that is shown sees; null while the service still shows another. */
+const view = () => (update !== null && update.looked === looked() ? update.view : null);
+
+let described = -Infinity;
 let rate = { name: null, from: 0, steps: 0, text: "unknown" };
 
 function show() {
   const name = looked();
   const robot = robots.get(name);
-  const view = update !== null && update.looked === name ? update.view : null;
+  const seen = view();
   element("looked-title").textContent = name ?? "Surroundings";
-  drawScene(element("scene"), view);
-  drawPad(element("pad"), view, about?.full_thrust ?? 1);
+  drawScene(element("scene"), seen);
+  drawPad(element("pad"), seen, about?.full_thrust ?? 1);
   charts.draw(robot?.history, seconds());
-  showReadings(name, robot?.row, view);
+  showReadings(name, robot?.row, seen);
   showChanges(robot?.history);
   showState();
   showAges();
   // A label that changes ten times a second could not be read.
   if (seconds() - described > 1) {
     described = seconds();
-    element("scene").setAttribute("aria-label", describeScene(view));
-    element("pad").setAttribute("aria-label", `Nominal action ${pair(view?.nominal)}, sent action ${pair(view?.action)}.`);
+    element("scene").setAttribute("aria-label", describeScene(seen));
+    element("pad").setAttribute("aria-label", `Nominal action ${pair(seen?.nominal)}, sent action ${pair(seen?.action)}.`);
   }
 }
 
-function showReadings(name, row, view) {
+function showReadings(name, row, seen) {
   setMode(element("mode"), row?.mode ?? null, "unknown");
   element("why").textContent = row ? why(row) : "";
   const told = {
@@ -186,17 +188,17 @@ function showReadings(name, row, view) {
     threshold: known(row?.threshold, 3),
     barrier: known(row?.barrier, 3, "m"),
     novelty: known(row?.novelty, 2) + (row?.suspect ? ` (${row.suspect})` : ""),
-    speed: known(view?.velocity && Math.hypot(...view.velocity), 2, "m/s"),
-    yaw: known(view?.yaw_rate, 2, "rad/s"),
+    speed: known(seen?.velocity && Math.hypot(...seen.velocity), 2, "m/s"),
+    yaw: known(seen?.yaw_rate, 2, "rad/s"),
     latency: known(row && row.seconds * 1000, 2, "ms"),
     rate: rateOf(name, row),
-    nominal: pair(view?.nominal),
-    sent: pair(view?.action),
   };
   for (const [key, text] of Object.entries(told)) {
     readings[key].textContent = text;
     readings[key].dataset.unknown = text.startsWith("unknown");
   }
+  element("nominal").textContent = pair(seen?.nominal);
+  element("sent").textContent = pair(seen?.action);
 }
 
 /** Decisions a second, counted over a second. */
@@ -211,7 +213,7 @@ function rateOf(name, row) {
 }
 
 function showChanges(past) {
-  const rows = (past?.changes ?? []).slice(0, 8).map(({ time, mode, text, began, ended }) => {
+  const rows = (past?.changes ?? []).slice(0, 7).map(({ time, mode, text, began, ended }) => {
     const row = make("tr");
     const badge = make("span", "mode");
     setMode(badge, mode);
@@ -240,14 +242,14 @@ function showAges() {
   document.body.dataset.live = live;
   element("connection").textContent = live ? "live" : heard === null ? "connecting" : "not connected";
   element("banner").hidden = live || (heard === null && lost === null);
-  const why_ = lost ?? "no update comes";
-  element("banner").textContent =
-    heard === null ? `Not connected: ${why_}. Trying again.` : `Not connected: ${why_}. What is shown is ${ageInWords(since)} old. Trying again.`;
+  const old = heard === null ? "" : ` What is shown is ${ageInWords(since)} old.`;
+  element("banner").textContent = `Not connected: ${lost ?? "no update comes"}.${old} Trying again.`;
   for (const [name, robot] of robots) showCard(robot, name, robot.row.age + (seconds() - robot.seen));
   const robot = robots.get(looked());
   const age = robot ? robot.row.age + (seconds() - robot.seen) : Infinity;
   element("looked").dataset.stale = age > STALE;
-  element("age").textContent = robot && age > STALE ? `last heard ${ageInWords(age)} ago` : "";
+  const still = view()?.heading === null ? "no heading: ahead is up" : "held still by the magnetometer";
+  element("age").textContent = !robot ? "" : age > STALE ? `last heard ${ageInWords(age)} ago` : still;
   if (!live) {
     element("state").textContent = "unknown";
     element("state").dataset.state = "unknown";
@@ -410,11 +412,7 @@ function announcer(place) {
 }
 
 const say = announcer(element("said"));
-const warnReader = announcer(element("warned"));
-
-function warn(text) {
-  warnReader(text);
-}
+const warn = announcer(element("warned"));
 
 element("theme").value = stored(localStorage, THEME) ?? "";
 element("theme").addEventListener("change", ({ target }) => {

@@ -2,8 +2,12 @@
 
 const NAMES = [
   "ink", "muted", "line", "panel", "kept", "hazard", "hazard-edge", "goal", "path", "velocity", "risk",
-  "nominal", "guided", "filtered", "fallback", "gate",
+  "nominal", "guided", "filtered", "fallback",
+  "by-risk", "by-dwell", "by-barrier", "by-novelty", "by-fault", "by-always",
 ];
+
+/** The page's font for a canvas, of some pixels. */
+export const font = (pixels) => `${pixels}px ${getComputedStyle(document.body).fontFamily}`;
 
 /** Name → colour; read anew by `readPalette` when the scheme changes. */
 export const palette = {};

@@ -2,24 +2,24 @@
 // the left [m]. Where the magnetometer tells a heading the picture stands still and the robot turns in it;
 // otherwise ahead is up.
 
-import { fitted, palette } from "./palette.js";
+import { fitted, font, palette } from "./palette.js";
 
 const HALF = 2.0; // from the robot to the picture's edge [m]
 const BODY = 0.1; // the robot's radius [m]
 const GOAL = 0.3; // the goal's radius [m]
 const AHEAD = 0.5; // seconds of velocity that the arrow shows
-const FONT = "12px system-ui, sans-serif";
 const TURN = 2 * Math.PI;
 
 /** Draws a view (see server/view.py), or that there is none. */
 export function drawScene(canvas, view) {
   const { context: c, width, height } = fitted(canvas);
+  if (!width || !height) return;
   const scale = Math.min(width, height) / 2 / HALF;
   const turn = view?.heading ?? Math.PI / 2;
   const [cos, sin] = [Math.cos(turn), Math.sin(turn)];
   // From the robot's frame to the screen.
   const at = (x, y) => [width / 2 + scale * (cos * x - sin * y), height / 2 - scale * (sin * x + cos * y)];
-  c.font = FONT;
+  c.font = font(12);
   c.lineJoin = c.lineCap = "round";
   rings(c, width, height, scale);
   if (!view || view.problem) {
@@ -32,7 +32,9 @@ export function drawScene(canvas, view) {
   goal(draw, view);
   path(draw, view);
   robot(draw, view);
-  words(c, view.heading === null ? "ahead is up (no heading)" : "turned by the magnetometer", 10, height - 10, "left");
+  c.textAlign = "left";
+  c.fillStyle = palette.muted;
+  for (const radius of [1.0, 2.0]) c.fillText(`${radius} m`, width / 2 + 4, height / 2 - radius * scale + 14);
 }
 
 /** What the picture shows, in words. */
@@ -66,9 +68,6 @@ function rings(c, width, height, scale) {
     c.beginPath();
     c.arc(width / 2, height / 2, radius * scale - (radius === HALF ? 1 : 0), 0, TURN);
     c.stroke();
-  }
-  for (const radius of [1.0, 2.0]) {
-    words(c, `${radius} m`, width / 2 + 4, height / 2 - radius * scale + 14, "left");
   }
 }
 
@@ -230,9 +229,9 @@ function head(c, x, y, angle, size) {
 /** The nominal and the sent action: thrust upwards as a share of full thrust, turn to the left and right. */
 export function drawPad(canvas, view, fullThrust) {
   const { context: c, width } = fitted(canvas);
+  if (!width) return;
   const middle = width / 2;
-  const reach = middle - 16;
-  c.font = "11px system-ui, sans-serif";
+  const reach = middle - 10;
   c.strokeStyle = palette.line;
   c.lineWidth = 1;
   c.strokeRect(middle - reach, middle - reach, 2 * reach, 2 * reach);
@@ -242,7 +241,6 @@ export function drawPad(canvas, view, fullThrust) {
   c.moveTo(middle - reach, middle);
   c.lineTo(middle + reach, middle);
   c.stroke();
-  words(c, "thrust", middle, 11, "center");
   const place = ([thrust, turn]) => [
     middle - reach * Math.max(-1, Math.min(1, turn)),
     middle - reach * Math.max(-1, Math.min(1, thrust / fullThrust)),
