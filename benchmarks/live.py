@@ -1,27 +1,30 @@
-"""What the live page costs `POST /act`: two services, one of which is watched, asked in turn.
+"""What the live page costs `POST /act`: one service, asked in turn with and without somebody who watches.
 
     python -m benchmarks.live models/NAME
 
-A process of its own reads the stream of the watched one and looks at the robot that asks. Rounds alternate, as
-in `benchmarks.recording`, whose table this is. What is told last is what the hub adds to a decision while
-nobody watches.
+Each round with a watcher is measured against the round beside it, so that what else the machine does hits
+both. The watcher looks at the robot that asks, and reads after the round: what a browser computes is not the
+service's. What is told last is what the hub adds to a decision while nobody watches.
 """
 
 from __future__ import annotations
 
-import subprocess
-import sys
+import socket
 import time
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any
+from urllib.parse import urlsplit
 
 import numpy as np
 import tyro
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.recording import Measured, RecordingBenchmark, alternate, bodies, slower
-from benchmarks.server import cases
+from benchmarks.recording import RecordingBenchmark, bodies, slower, times
+from benchmarks.server import Connection, cases
 from evaluation.service import Service
 from filter import FilterConfig
 from models import Bundle
@@ -32,63 +35,82 @@ from server.observer import Answered
 from server.schema import ActRequest
 from server.view import Views
 
-_READ = "import sys, urllib.request as u; s = u.urlopen(sys.argv[1])\nwhile s.read1(65536): pass"
+FloatArray = NDArray[np.float64]
+
+_QUANTILES = (50.0, 99.0, 99.9)
 
 
-def run(config: RecordingBenchmark) -> dict[str, dict[str, Measured]]:
-    """What was measured by case and service."""
+@dataclass(frozen=True)
+class LiveBenchmark(RecordingBenchmark):
+    """Measures POST /act with and without a watcher."""
+
+    requests: int = 2000
+    """Requests a round: long enough for some updates."""
+    rounds: int = 30
+    """Rounds of each kind."""
+
+
+@contextmanager
+def watched(url: str) -> Iterator[None]:
+    """Somebody watches; the first update has come."""
+    address = urlsplit(url)
+    with socket.create_connection((address.hostname, address.port), timeout=10.0) as stream:
+        stream.sendall(f"GET /live HTTP/1.1\r\nhost: {address.netloc}\r\n\r\n".encode())
+        seen = b""
+        while b'"looked"' not in seen:
+            seen += stream.recv(65536)
+        yield
+        stream.setblocking(False)
+        if not stream.recv(65536):
+            raise RuntimeError("the service ended the stream")
+
+
+def run(config: LiveBenchmark) -> dict[str, dict[str, FloatArray]]:
+    """Case → "alone" and "watched" → time of each request [µs], (rounds, requests)."""
     level = Bundle.load(config.bundle).manifest.level
-    command = [sys.executable, "-m", "server.serve", str(config.bundle), "--port", "0", "--gate", config.gate]
-    with ExitStack() as stack:
-        services = {
-            "alone": stack.enter_context(Service.run(command)),
-            "watched": stack.enter_context(Service.run(command)),
-        }
-        reader = subprocess.Popen([sys.executable, "-c", _READ, f"{services['watched'].url}/live"])
-        stack.callback(reader.terminate)
-        time.sleep(1.0)
-        measured = {
-            name: alternate(services, bodies(level, case.asked), config)
-            for name, case in cases(level).items()
-        }
-        if reader.poll() is not None:
-            raise RuntimeError("nobody watched to the end")
+    measured = {}
+    with Service.start(config.bundle, config.gate) as service:
+        for name, case in cases(level).items():
+            connection = Connection(f"{service.url}/act", *bodies(level, case.asked))
+            connection.times(500)
+            taken: dict[str, list[list[float]]] = {"alone": [], "watched": []}
+            for round_ in range(config.rounds):
+                for kind in list(taken)[:: 1 if round_ % 2 else -1]:
+                    if kind == "alone":
+                        taken[kind].append(times(connection, config.requests, config.pace))
+                        continue
+                    with watched(service.url):
+                        taken[kind].append(times(connection, config.requests, config.pace))
+            connection.close()
+            measured[name] = {kind: np.array(rows) for kind, rows in taken.items()}
     return measured
 
 
-def noted(config: RecordingBenchmark, calls: int = 100_000) -> float:
-    """What the hub adds to a decision [µs], without the call itself of a decision."""
+def noted(config: LiveBenchmark, calls: int = 5000, rounds: int = 20) -> float:
+    """What the hub adds to a decision while nobody watches [µs]."""
     monitor = Monitor.load(config.bundle, config.gate)
     hub = Hub(Views(monitor, FilterConfig()), Standing(Lifecycle(), monitor), {})
     observation: list[float] = cases(monitor.bundle.manifest.level)["nominal"].asked["observation"]
     asked = ActRequest(observation=observation, robot="ada")
     one: Any = Answered(0, ("h", 1), "/act", b"", 1e-3, 200, b"", [asked], [monitor.decide(observation)])
-    times = []
-    for _ in range(20):
+    taken = []
+    for _ in range(rounds):
         started = time.perf_counter()
-        for _ in range(calls // 20):
+        for _ in range(calls):
             hub.answered(one)
-        times.append((time.perf_counter() - started) / (calls // 20))
-    return float(np.median(times)) * 1e6
+        taken.append((time.perf_counter() - started) / calls)
+    return min(taken) * 1e6  # what the machine does besides only adds
 
 
 def main() -> None:
     """Entry point of `python -m benchmarks.live`."""
-    config = tyro.cli(RecordingBenchmark, prog="python -m benchmarks.live")
-    table = Table("POST /act", "", "median [µs]", "slower by (95 %)", "p99 [µs]", "p99 / alone")
+    config = tyro.cli(LiveBenchmark, prog="python -m benchmarks.live")
+    table = Table("POST /act", "", *(f"p{q:g} [µs]" for q in _QUANTILES), "watched: slower by (95 %)")
     for name, both in run(config).items():
-        alone = both["alone"]
-        for kind, one in both.items():
-            watched = kind == "watched"
-            p99 = np.percentile(one.taken, 99)
-            table.add_row(
-                "" if watched else name,
-                kind,
-                f"{np.median(one.taken):,.0f}",
-                slower(np.median(alone.taken, axis=1), np.median(one.taken, axis=1)) if watched else "",
-                f"{p99:,.0f}",
-                f"{p99 / np.percentile(alone.taken, 99):.2f}" if watched else "",
-            )
+        for kind, taken in both.items():
+            quantiles = (f"{value:,.0f}" for value in np.percentile(taken, _QUANTILES))
+            by = slower(*(np.median(both[k], axis=1) for k in ("alone", "watched")))
+            table.add_row(name if kind == "alone" else "", kind, *quantiles, by if kind == "watched" else "")
     console = Console(width=120)
     console.print(table)
     console.print(f"the hub takes note of a decision in {noted(config):.2f} µs")

@@ -31,7 +31,8 @@ _SILENT = 1.0
 """A robot that was silent for so long makes room for another [s]."""
 _FORGOTTEN = 600.0
 """A robot that was silent for so long is no longer shown [s]."""
-_SEVERITY = {Mode.NOMINAL: 0, Mode.GUIDED: 1, Mode.FILTERED: 2, Mode.FALLBACK: 3}
+_NOMINAL = Mode.NOMINAL
+_SEVERITY = {_NOMINAL: 0, Mode.GUIDED: 1, Mode.FILTERED: 2, Mode.FALLBACK: 3}
 
 Name = str | tuple[Any, int]
 """A robot's own name, or the connection on which it asks and its place in the batch."""
@@ -55,12 +56,25 @@ class Operation(Protocol):
 class Robot:
     """One robot: what it was told last, and what is worth knowing of all since the last update."""
 
-    __slots__ = ("asked", "decision", "heard", "least", "peak", "seconds", "slowest", "steps", "worst")
+    __slots__ = (
+        "asked",
+        "decision",
+        "heard",
+        "least",
+        "peak",
+        "rank",
+        "seconds",
+        "slowest",
+        "steps",
+        "worst",
+    )
 
     asked: ActRequest
     decision: Decision
     worst: Decision
     """The last of those of the severest mode."""
+    rank: int
+    """How severe that is."""
     heard: float
     """When it was told, on the monotonic clock [s]."""
     seconds: float
@@ -80,12 +94,14 @@ class Robot:
 
     def begin(self) -> None:
         """An update begins."""
-        self.steps, self.slowest, self.peak, self.least = 0, 0.0, -math.inf, math.inf
+        self.steps, self.rank, self.slowest, self.peak, self.least = 0, -1, 0.0, -math.inf, math.inf
 
     def note(self, asked: ActRequest, decision: Decision, seconds: float, heard: float) -> None:
         """Takes note of a decision."""
-        if not self.steps or _SEVERITY[decision.mode] >= _SEVERITY[self.worst.mode]:
-            self.worst = decision
+        mode = decision.mode
+        rank = 0 if mode is _NOMINAL else _SEVERITY[mode]
+        if rank >= self.rank:
+            self.rank, self.worst = rank, decision
         self.asked, self.decision, self.seconds, self.heard = asked, decision, seconds, heard
         self.steps += 1
         self.slowest = max(self.slowest, seconds)
