@@ -46,6 +46,7 @@ class Operation(Protocol):
 
         Returns:
             state: starting, ready, degraded, hold, draining or stopped.
+            why: why that, in words; may be left out.
             alarms: a list of name, state (clear, pending, active, latched), since [s since 1970], value,
                 limit, acknowledged, cause.
             counters: name → number.
@@ -193,6 +194,7 @@ class Hub:
 
     Attributes:
         faults: what went wrong here so far.
+        views: as given; to be replaced when another bundle decides.
     """
 
     def __init__(
@@ -204,7 +206,7 @@ class Hub:
         patience: float = PATIENCE,
     ) -> None:
         self.faults = Faults("lagnet.live")
-        self._views = views
+        self.views = views
         self._operation = operation
         self._about = json.dumps(dict(about), allow_nan=False)
         self._clock = clock
@@ -307,7 +309,7 @@ class Hub:
     def _look(self, named: dict[str, Robot], wanted: str | None) -> str:
         """What the robot sees that is looked at, as JSON."""
         text = wanted if wanted in named else next(iter(named), None)
-        view = None if text is None else self._views.of(named[text].asked, named[text].decision)
+        view = None if text is None else self.views.of(named[text].asked, named[text].decision)
         return f'"looked": {json.dumps(text)}, "view": {json.dumps(view, allow_nan=False)}'
 
     def _makes_room(self, now: float) -> bool:

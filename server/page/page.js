@@ -29,7 +29,6 @@ const stream = new Stream({
   about(told) {
     about = told;
     element("model").textContent = told.model;
-    element("gate").textContent = gateInWords(told);
   },
   update(told) {
     update = told;
@@ -55,8 +54,10 @@ const stream = new Stream({
   },
 });
 
-function gateInWords({ gate, threshold }) {
-  return gate === "risk" ? `risk, opens above λ ${round(threshold, 3)}` : gate;
+/** The threshold is that of the bundle which decides now. */
+function gateInWords(threshold) {
+  if (about === null) return "unknown";
+  return about.gate === "risk" ? `risk, opens above λ ${round(threshold ?? about.threshold, 3)}` : about.gate;
 }
 
 // --- robots ---------------------------------------------------------------------------------------------
@@ -182,6 +183,7 @@ function show() {
 
 function showReadings(name, row, seen) {
   setMode(element("mode"), row?.mode ?? null, "unknown");
+  element("gate").textContent = gateInWords(row?.threshold);
   element("why").textContent = row ? why(row) : "";
   const told = {
     risk: known(row?.risk, 3),
@@ -232,6 +234,8 @@ function showState() {
   const state = update?.operation.state ?? "unknown";
   element("state").textContent = state;
   element("state").dataset.state = state;
+  // A service that is ready need not say why.
+  element("state-why").textContent = state === "ready" ? "" : (update?.operation.why ?? "");
   if (update?.operation.model) element("model").textContent = update.operation.model;
 }
 

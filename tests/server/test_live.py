@@ -238,7 +238,8 @@ def test_places_are_those_when_the_action_takes_effect(hand, tiny_bundle: Path) 
     places = np.array([[0.5, 0.2]])
     observation = hand.observe(places, velocity=(0.8, 0.2), yaw_rate=1.5, goal=places[0])
     seen = Views(late, config).of(
-        ActRequest(observation=observation.tolist(), hazards=places.tolist()), late.decide(observation, places)
+        ActRequest(observation=observation.tolist(), hazards=places.tolist()),
+        late.decide(observation, places),
     )
     [x, y, *_] = seen["obstacles"][0]
     assert np.hypot(x - 0.5, y - 0.2) > 0.03
