@@ -1,11 +1,12 @@
 // The charts of the last minute: uPlot, and a ribbon of modes drawn by hand on the same axis.
 
 import uPlot from "./uplot/uPlot.esm.js";
-import { MINUTE } from "./history.js";
+import { MINUTE, STALE } from "./history.js";
 import { font, palette } from "./palette.js";
 
 const LEFT = 46; // width of the vertical axes: the charts stand in line
 const RIGHT = 12;
+const TICK = 0.1; // seconds between two updates
 const MODES = ["nominal", "guided", "filtered", "fallback"];
 
 let now = 0;
@@ -140,12 +141,13 @@ function span(u, from, to) {
   return [x, Math.max(u.valToPos(to, "x", true) - x, 1.5)];
 }
 
-/** Calls back for every run of equal values that are not null; a sample stands for the tenth before it. */
+/** Calls back for every run of equal values that are not null; a sample stands for the time since the last. */
 function runs(at, values, draw) {
   let start = 0;
   for (let i = 1; i <= values.length; i += 1) {
-    if (i < values.length && values[i] === values[start] && at[i] - at[i - 1] < 1) continue;
-    if (values[start] !== null) draw(at[start] - 0.1, at[i - 1], values[start]);
+    if (i < values.length && values[i] === values[start] && at[i] - at[i - 1] < STALE) continue;
+    const before = start && at[start] - at[start - 1] < STALE ? at[start - 1] : at[start] - TICK;
+    if (values[start] !== null) draw(before, at[i - 1], values[start]);
     start = i;
   }
 }

@@ -1,6 +1,7 @@
 // What became of one robot over the last minute, and when its mode changed.
 
 export const MINUTE = 60; // seconds that are kept
+export const STALE = 1; // seconds after which nothing counts as live
 export const SEVERITY = { nominal: 0, guided: 1, filtered: 2, fallback: 3 };
 const MOST_CHANGES = 30;
 
@@ -14,6 +15,8 @@ export class History {
   /** Takes a robot's row of an update; whether its mode changed. */
   add(row, now) {
     const since = row.since;
+    // A robot may ask less often than updates come.
+    if (!since && row.age < STALE) return false;
     const { at, risk, threshold, barrier, latency, mode, cause } = this.columns;
     at.push(now);
     threshold.push(row.threshold);

@@ -2,12 +2,11 @@
 // and its age is told: nothing stale looks live.
 
 import { Charts } from "./charts.js";
-import { History, why } from "./history.js";
+import { History, STALE, why } from "./history.js";
 import { readPalette } from "./palette.js";
 import { describeScene, drawPad, drawScene } from "./scene.js";
 import { Stream } from "./stream.js";
 
-const STALE = 1.0; // seconds after which nothing counts as live
 const GONE = 60.0; // seconds after which a robot that the service no longer names leaves the list
 const SAY_EVERY = 5.0; // seconds between two announcements to a screen reader
 const THEME = "lagnet.theme";
