@@ -7,7 +7,6 @@ import hashlib
 import json
 import re
 import signal
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -369,10 +368,8 @@ def test_a_service_that_is_watched_answers_and_stops_at_once(service: Service) -
         lines = (line.decode() for line in stream)
         update = next(line for line in lines if '"ada"' in line)
         assert json.loads(update.removeprefix("data: "))["looked"] == "ada"
-        begun = time.monotonic()
         service.process.send_signal(signal.SIGTERM)
         assert any('"draining"' in line for line in lines)
         assert all(lines)
-        assert service.process.wait(10.0) == 0
-        assert time.monotonic() - begun < 4.0  # uvicorn alone would wait for 5 s
-    assert service.complaints() == ""
+        assert service.process.wait(20.0) == 0
+    assert service.complaints() == ""  # uvicorn would say that it waited for 5 s in vain

@@ -221,6 +221,7 @@ def ink(page: Any, canvas: str) -> int:
     return int(page.evaluate(script, canvas))
 
 
+@pytest.mark.long
 def test_a_live_episode_and_a_restart_of_the_service(
     opened: Any, tiny_bundle: Path, unused_port: int
 ) -> None:
