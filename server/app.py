@@ -11,8 +11,12 @@ from fastapi.responses import JSONResponse
 from monitor import Monitor
 from recorder import Recorder
 from server.desk import Desk
-from server.guard import ACT, BATCH, Guard
+from server.freshness import Freshness
+from server.guard import Guard
+from server.keys import ACT, BATCH, Keys
 from server.observer import Observer, Recording
+from server.robots import robots_router
+from server.safety import Safety
 from server.schema import MAX_ROBOTS, ActReply, ActRequest, BatchReply, ModelReply
 
 MAX_BODY = 65536
@@ -22,10 +26,15 @@ MANY_FAULTS = 5
 BATCH_BODY = 16
 """The body of a batch may be so many times as large."""
 
-_ERRORS: dict[int | str, dict[str, Any]] = {
+_REFUSALS: dict[int | str, dict[str, Any]] = {
+    401: {"description": "no valid key"},
+    403: {"description": "a key for less than this"},
     413: {"description": "body too large"},
+}
+_ERRORS: dict[int | str, dict[str, Any]] = _REFUSALS | {
     422: {"description": "names the field that is wrong"},
     500: {"description": "the decision could not be told"},
+    503: {"description": "overloaded; Retry-After says when to try again"},
 }
 
 
@@ -43,20 +52,26 @@ class Lifecycle:
 def create_app(
     monitor: Monitor,
     lifecycle: Lifecycle | None = None,
-    api_key: str | None = None,
+    keys: Keys | None = None,
     max_body: int = MAX_BODY,
     recorder: Recorder | None = None,
+    safety: Safety | None = None,
+    freshness: Freshness | None = None,
 ) -> Guard:
     """The service around one monitor that is loaded and warmed up.
 
     Args:
         monitor: what decides.
         lifecycle: shared with whoever stops the service.
-        api_key: the key that every request but the health checks must carry; None asks for none.
+        keys: those that every request but the health checks must carry one of; None asks for none.
         max_body: most bytes of a request's body; a batch's may be `BATCH_BODY` times as large.
         recorder: what records the decisions, if any does.
+        safety: the limits within which it decides.
+        freshness: shared with whoever looks for silent robots; by default one within `safety.freshness`.
     """
     state = lifecycle or Lifecycle()
+    limits = safety or Safety()
+    known = freshness or Freshness(limits.freshness, monitor.faults.note)
     model = ModelReply.of(monitor)
     # No /docs: its page loads scripts from other hosts. /openapi.json is there.
     app = FastAPI(
@@ -94,7 +109,9 @@ def create_app(
         return JSONResponse({"status": "ready"})
 
     observers: list[Observer] = [] if recorder is None else [Recording(recorder)]
-    return Guard(Desk(app, monitor, model, observers), api_key, max_body, {BATCH: BATCH_BODY * max_body})
+    app.include_router(robots_router(known, _REFUSALS))
+    desk = Desk(app, monitor, model, observers, limits, known)
+    return Guard(desk, keys or Keys(), max_body, {BATCH: BATCH_BODY * max_body})
 
 
 def _act_schema(model: ModelReply) -> dict[str, Any]:
