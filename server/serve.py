@@ -14,6 +14,7 @@ import sys
 import time
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Annotated
@@ -254,7 +255,22 @@ class DrainingServer(uvicorn.Server):
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Starts to listen, and says so."""
-        await super().startup(sockets)
+        await super().startup([])
+        # uvicorn would wait a minute for a TLS handshake, in which the door sees no connection yet.
+        patience = self._door.patience.read if self.config.ssl else None
+        protocol = partial(
+            Connection, config=self.config, server_state=self._door, app_state=self.lifespan.state
+        )
+        self.servers = [
+            await asyncio.get_running_loop().create_server(
+                protocol,
+                sock=listener,
+                ssl=self.config.ssl,
+                ssl_handshake_timeout=patience,
+                backlog=self.config.backlog,
+            )
+            for listener in sockets or []
+        ]
         sys.stdout.write(self._announcement + "\n")
         sys.stdout.flush()
 
