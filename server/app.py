@@ -119,6 +119,9 @@ def _act_schema(model: ModelReply) -> dict[str, Any]:
     schema = ActRequest.model_json_schema()
     size = model.observation_size
     schema["properties"]["observation"] |= {"minItems": size, "maxItems": size}
+    # In place: a document has its definitions elsewhere, and a reply's memory is not quite a request's.
+    kinds = schema["properties"]["memory"]["anyOf"]
+    kinds[0] = schema.pop("$defs")[kinds[0]["$ref"].rpartition("/")[2]]
     return schema
 
 
