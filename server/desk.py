@@ -29,6 +29,9 @@ from server.schema import ActRequest, BatchReply, BatchRequest, ModelReply, Refu
 
 FloatArray = NDArray[np.float64]
 
+UNDECIDED = "not decided: "
+"""What the reason begins with where the monitor was not asked, or did not answer in time."""
+
 _MAX_ERRORS = 8
 _QUICK = 0.005
 """A decision within this time is made at once [s]: a health check may wait for it."""
@@ -247,7 +250,7 @@ class Desk:
         past = np.zeros(1, MEMORY) if memory is None else copy_of(memory)
         if unfit.over:
             past["left"] = 0
-        return self._monitor.fall_back(past, unfit.reason)[0]
+        return self._monitor.fall_back(past, UNDECIDED + unfit.reason)[0]
 
     def _told(self, decision: Decision, asked: ActRequest, started: float) -> Reply:
         seconds = time.perf_counter() - started
