@@ -202,12 +202,7 @@ class Monitor:
         return Decisions.join([self._decide_or_fall_back(*robot) for robot in alone])
 
     def fall_back(self, memory: Memory, reason: str) -> Decisions:
-        """The fallback of N robots: their plans go on, then the safe action within this bundle's bounds.
-
-        Args:
-            memory: (N,) of `MEMORY`.
-            reason: why nothing else is decided.
-        """
+        """The fallback of N robots with this memory (N,): their plans, then the bundle's safe action."""
         return fall_back(memory, reason, self.gate.threshold, self._safe)
 
     def _decide(

@@ -15,7 +15,7 @@ from server.freshness import Freshness
 from server.guard import Guard
 from server.keys import ACT, BATCH, Keys
 from server.observer import Observer, Recording
-from server.robots import robots_router
+from server.robots import RESET, robots_router
 from server.safety import Safety
 from server.schema import MAX_ROBOTS, ActReply, ActRequest, BatchReply, ModelReply
 
@@ -30,6 +30,9 @@ _REFUSALS: dict[int | str, dict[str, Any]] = {
     401: {"description": "no valid key"},
     403: {"description": "a key for less than this"},
     413: {"description": "body too large"},
+}
+_ACT_LINKS: dict[int | str, dict[str, Any]] = {
+    200: {"links": {"reset": {"operationId": RESET, "parameters": {"name": "$request.body#/robot"}}}}
 }
 _ERRORS: dict[int | str, dict[str, Any]] = _REFUSALS | {
     422: {"description": "names the field that is wrong"},
@@ -80,7 +83,12 @@ def create_app(
 
     # These two document their paths; `Desk` answers them before FastAPI is asked, at a third of the cost, and
     # with errors that name the field without repeating the input, which may be NaN.
-    @app.post(ACT, response_model=ActReply, responses=_ERRORS, openapi_extra=_body_of(_act_schema(model)))
+    @app.post(
+        ACT,
+        response_model=ActReply,
+        responses=_ERRORS | _ACT_LINKS,
+        openapi_extra=_body_of(_act_schema(model)),
+    )
     async def act() -> None:
         raise NotImplementedError
 

@@ -70,7 +70,7 @@ class RefusedError(ValueError):
 class Desk:
     """Answers `POST /act` and `POST /act/batch`, and hands everything else on.
 
-    A decision takes a fraction of a millisecond and is made at once; another thread would cost 20 us more.
+    A decision takes a fraction of a millisecond and is made at once; another thread would cost 50 us more.
     While decisions are slow, and until they have been seen to be quick, they are made in a thread, so that
     health checks do not wait for them. Where there is a deadline they always are: nothing can interrupt the
     event loop's own thread, and whatever hung there would hold up every robot.

@@ -10,6 +10,9 @@ from pydantic import BaseModel
 
 from server.freshness import Freshness, RobotState
 
+RESET = "reset_robot"
+"""The id of the operation that ends a hold, for links to it."""
+
 
 class RobotReply(BaseModel):
     """What is known of one robot; see `server.freshness.Seen`.
@@ -57,7 +60,11 @@ def robots_router(freshness: Freshness, refusals: dict[int | str, dict[str, Any]
         seen = freshness.robots(time.perf_counter())
         return RobotsReply(robots=[RobotReply.model_validate(each, from_attributes=True) for each in seen])
 
-    @router.post("/robots/{name}/reset", responses={404: {"description": "no robot of this name is known"}})
+    @router.post(
+        "/robots/{name}/reset",
+        operation_id=RESET,
+        responses={404: {"description": "no robot of this name is known"}},
+    )
     async def reset(name: Annotated[str, Path(pattern=r"^[A-Za-z0-9_.:-]{1,64}$")]) -> dict[str, str]:
         if not freshness.reset(name):
             raise HTTPException(404, "no robot of this name is known")

@@ -94,7 +94,7 @@ class ServeConfig:
     tls_key: Path | None = None
     """File with the certificate's key (PEM, no passphrase)."""
     deadline_ms: float | None = None
-    """How long a decision may take [ms]; then the fallback is sent. Decisions then take about 0.02 ms longer.
+    """How long a decision may take [ms]; then the fallback is sent. Decisions then take about 0.05 ms longer.
     By default each takes as long as it takes."""
     max_age_ms: float | None = None
     """How old an observation may be, by its stamp [ms]; then, and where it has no stamp or no robot's name,
