@@ -24,6 +24,7 @@ from decision.memory import (
     next_of_plan,
     remember_sent,
 )
+from decision.parts import in_parts
 
 __all__ = [
     "HISTORY",
@@ -45,6 +46,7 @@ __all__ = [
     "copy_of",
     "fall_back",
     "hazards_of_one",
+    "in_parts",
     "memory_from_json",
     "memory_of",
     "memory_to_json",

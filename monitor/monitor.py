@@ -22,6 +22,7 @@ from decision import (
     Origin,
     fall_back,
     hazards_of_one,
+    in_parts,
     memory_of,
     next_of_plan,
     texts,
@@ -70,6 +71,7 @@ class Monitor:
     Attributes:
         faults: what went wrong so far.
         robot: the constants of the bundle's robot.
+        look: what N robots see, and nothing is decided; see `ActionFilter.look`.
 
     Raises:
         MonitorError: for an unknown gate, a threshold that is not finite and >= 0 or stands beside a whole
@@ -98,6 +100,7 @@ class Monitor:
         self.gate = Gate(gate, wanted, manifest.hysteresis, manifest.dwell) if isinstance(gate, str) else gate
         self._networks = networks
         self._filter = action_filter
+        self.look = action_filter.look
         self._watch = watch
         self._low = np.array(manifest.action_low, np.float64)
         self._high = np.array(manifest.action_high, np.float64)
@@ -159,7 +162,7 @@ class Monitor:
             row = np.array(observation, dtype=np.float64)[None]
             given = None if hazards is None else hazards_of_one(hazards)
         except (TypeError, ValueError) as error:
-            return self._fall_back(past, self._bad(error))[0]
+            return self.fall_back(past, self._bad(error))[0]
         return self._decide_or_fall_back(row, given, past, lost)[0]
 
     def decide_batch(
@@ -183,11 +186,7 @@ class Monitor:
         given = None if hazards is None else np.asarray(hazards, dtype=np.float64)
         if given is not None and (given.ndim != 3 or given.shape[::2] != (len(rows), 2)):
             raise ValueError(f"hazards must have shape [{len(rows)}, n, 2], got {given.shape}")
-        return self._decide_or_fall_back(rows, given, memory_of(len(rows), memory))
-
-    def look(self, observation: FloatArray, hazards: FloatArray | None, memory: Memory) -> Scene:
-        """What N robots see, and nothing decided; arguments and errors as `filter.BarrierFilter.look`."""
-        return self._filter.look(observation, hazards, memory)
+        return in_parts(self._decide_or_fall_back, rows, given, memory_of(len(rows), memory))
 
     def _decide_or_fall_back(
         self, observation: FloatArray, hazards: FloatArray | None, memory: Memory, lost: str | None = None
@@ -197,13 +196,17 @@ class Monitor:
             return self._decide(observation, hazards, memory, lost)
         except Exception as error:  # noqa: BLE001 - whatever it is, the robot needs an action
             if len(observation) <= 1:
-                return self._fall_back(memory, self._note(error))
+                return self.fall_back(memory, self._note(error))
         # Something in one row spoils the batch: decide one by one, so that only its own robot gets the
         # fallback.
         rows = [slice(i, i + 1) for i in range(len(observation))]
         near = [None if hazards is None else hazards[i] for i in rows]
         alone = zip((observation[i] for i in rows), near, (memory[i] for i in rows), strict=True)
         return Decisions.join([self._decide_or_fall_back(*robot) for robot in alone])
+
+    def fall_back(self, memory: Memory, reason: str) -> Decisions:
+        """The fallback of N robots with this memory (N,): their plans, then the bundle's safe action."""
+        return fall_back(memory, reason, self.gate.threshold, self._safe)
 
     def _decide(
         self, observation: FloatArray, hazards: FloatArray | None, memory: Memory, lost: str | None
@@ -297,9 +300,6 @@ class Monitor:
     def _bad(self, error: Exception) -> str:
         self.faults.note("bad input", str(error))
         return f"bad input: {error}"
-
-    def _fall_back(self, memory: Memory, reason: str) -> Decisions:
-        return fall_back(memory, reason, self.gate.threshold, self._safe)
 
     def _warm_up(self) -> None:
         """Runs every part once, or raises MonitorError if not even a robot at rest can be decided about."""

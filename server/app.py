@@ -13,9 +13,13 @@ from filter import FilterConfig
 from monitor import Monitor
 from recorder import Recorder
 from server.desk import Desk
-from server.guard import ACT, BATCH, Guard
+from server.freshness import Freshness
+from server.guard import Guard
+from server.keys import ACT, BATCH, Keys
 from server.live import Hub, Operation
 from server.observer import Observer, Recording
+from server.robots import RESET, robots_router
+from server.safety import Safety
 from server.schema import MAX_ROBOTS, ActReply, ActRequest, BatchReply, ModelReply
 from server.static import routes
 from server.view import Views
@@ -27,10 +31,18 @@ MANY_FAULTS = 5
 BATCH_BODY = 16
 """The body of a batch may be so many times as large."""
 
-_ERRORS: dict[int | str, dict[str, Any]] = {
+_REFUSALS: dict[int | str, dict[str, Any]] = {
+    401: {"description": "no valid key"},
+    403: {"description": "a key for less than this"},
     413: {"description": "body too large"},
+}
+_ACT_LINKS: dict[int | str, dict[str, Any]] = {
+    200: {"links": {"reset": {"operationId": RESET, "parameters": {"name": "$request.body#/robot"}}}}
+}
+_ERRORS: dict[int | str, dict[str, Any]] = _REFUSALS | {
     422: {"description": "names the field that is wrong"},
     500: {"description": "the decision could not be told"},
+    503: {"description": "overloaded; Retry-After says when to try again"},
 }
 
 
@@ -70,9 +82,11 @@ class Standing:
 def create_app(
     monitor: Monitor,
     lifecycle: Lifecycle | None = None,
-    api_key: str | None = None,
+    keys: Keys | None = None,
     max_body: int = MAX_BODY,
     recorder: Recorder | None = None,
+    safety: Safety | None = None,
+    freshness: Freshness | None = None,
     filter_config: FilterConfig | None = None,
     operation: Operation | None = None,
 ) -> Guard:
@@ -81,13 +95,17 @@ def create_app(
     Args:
         monitor: what decides.
         lifecycle: shared with whoever stops the service.
-        api_key: the key that every request but the health checks must carry; None asks for none.
+        keys: those that every request but the health checks must carry one of; None asks for none.
         max_body: most bytes of a request's body; a batch's may be `BATCH_BODY` times as large.
         recorder: what records the decisions, if any does.
+        safety: the limits within which it decides.
+        freshness: shared with whoever looks for silent robots; by default one within `safety.freshness`.
         filter_config: the filter's settings; None: the defaults.
         operation: tells the page where the service stands; None: the life cycle and the faults alone.
     """
     state = lifecycle or Lifecycle()
+    limits = safety or Safety()
+    known = freshness or Freshness(limits.freshness, monitor.faults.note)
     model = ModelReply.of(monitor)
     # No /docs: its page loads scripts from other hosts. /openapi.json is there.
     app = FastAPI(
@@ -96,7 +114,12 @@ def create_app(
 
     # These two document their paths; `Desk` answers them before FastAPI is asked, at a third of the cost, and
     # with errors that name the field without repeating the input, which may be NaN.
-    @app.post(ACT, response_model=ActReply, responses=_ERRORS, openapi_extra=_body_of(_act_schema(model)))
+    @app.post(
+        ACT,
+        response_model=ActReply,
+        responses=_ERRORS | _ACT_LINKS,
+        openapi_extra=_body_of(_act_schema(model)),
+    )
     async def act() -> None:
         raise NotImplementedError
 
@@ -130,8 +153,10 @@ def create_app(
     hub = Hub(views, operation or Standing(state, monitor), facts)
     state.at_end.append(hub.close)
     app.router.routes.extend(routes(hub))
+    app.include_router(robots_router(known, _REFUSALS))
     observers: list[Observer] = [hub] if recorder is None else [hub, Recording(recorder)]
-    return Guard(Desk(app, monitor, model, observers), api_key, max_body, {BATCH: BATCH_BODY * max_body})
+    desk = Desk(app, monitor, model, observers, limits, known)
+    return Guard(desk, keys or Keys(), max_body, {BATCH: BATCH_BODY * max_body})
 
 
 def _act_schema(model: ModelReply) -> dict[str, Any]:
@@ -139,6 +164,9 @@ def _act_schema(model: ModelReply) -> dict[str, Any]:
     schema = ActRequest.model_json_schema()
     size = model.observation_size
     schema["properties"]["observation"] |= {"minItems": size, "maxItems": size}
+    # In place: a document has its definitions elsewhere, and a reply's memory is not quite a request's.
+    kinds = schema["properties"]["memory"]["anyOf"]
+    kinds[0] = schema.pop("$defs")[kinds[0]["$ref"].rpartition("/")[2]]
     return schema
 
 

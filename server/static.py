@@ -10,7 +10,7 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, Response, StreamingResponse
 from starlette.routing import Route
 
-from server.guard import HOME, PAGE
+from server.keys import HOME, PAGE
 from server.live import Hub
 
 STREAM = "/live"

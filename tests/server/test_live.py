@@ -26,6 +26,7 @@ from filter import FilterConfig
 from monitor import Monitor
 from server import live
 from server.app import create_app
+from server.keys import Keys
 from server.live import Hub, Robot
 from server.observer import Answered
 from server.schema import ActRequest
@@ -346,7 +347,7 @@ def test_uplot_is_what_was_published() -> None:
 
 
 def test_the_files_need_no_key_and_the_stream_does(monitor: Monitor) -> None:
-    app = TestClient(create_app(monitor, api_key="secret"))
+    app = TestClient(create_app(monitor, keys=Keys(act="secret")))
     assert app.get("/").status_code == 200
     assert app.get(f"/{addresses(app)[0]}").status_code == 200
     assert app.get("/live").status_code == 401

@@ -25,6 +25,7 @@ from evaluation.service import Service
 from monitor import Monitor
 from pointgoal.vector import PointGoalVectorEnv
 from server.app import Lifecycle, create_app
+from server.keys import Keys
 
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 pytestmark = pytest.mark.skipif(BROWSER is None, reason="no Chromium here: apt-get install chromium")
@@ -97,10 +98,10 @@ class Operation:
 class Running:
     """A service in this process, whose operation a test has in hand."""
 
-    def __init__(self, monitor: Monitor, api_key: str | None = None) -> None:
+    def __init__(self, monitor: Monitor, keys: Keys | None = None) -> None:
         self.operation = Operation()
         self._lifecycle = Lifecycle()
-        app = create_app(monitor, self._lifecycle, api_key, operation=self.operation)
+        app = create_app(monitor, self._lifecycle, keys, operation=self.operation)
 
         async def answers(scope: Scope, receive: Receive, send: Send) -> None:
             if scope["type"] == "http" and scope["path"].startswith("/alarms/"):
@@ -299,9 +300,9 @@ def test_acknowledging_asks_for_the_act_key(opened: Any, service: Running) -> No
 
 
 def test_a_service_with_a_key_is_read_with_it(opened: Any, monitor: Monitor) -> None:
-    service = Running(monitor, api_key="secret")
+    service = Running(monitor, Keys("secret", ACT_KEY))
     try:
-        service.act("ada", key="secret")
+        service.act("ada", key=ACT_KEY)
         page = opened(service.url, bears=("401",))
         page.get_by_role("dialog").wait_for()
         assert page.locator(".card").count() == 0
