@@ -10,6 +10,8 @@ from functools import cached_property
 from typing import Any
 
 ACT, BATCH = "/act", "/act/batch"
+ALARM = "/alarms/"
+"""What the path of an alarm begins with, at which it is acknowledged."""
 HOME, PAGE = "/", "/page/"
 """The live page, and what its files' paths begin with: they hold no secret."""
 OPEN_PATHS = frozenset({"/healthz", "/readyz", HOME})
@@ -24,7 +26,7 @@ class Level(IntEnum):
     READ = 1
     """Look at it: whatever is a GET."""
     ACT = 2
-    """Ask for decisions."""
+    """Ask for decisions, and acknowledge alarms."""
     ADMIN = 3
     """Change it: whatever else is no GET."""
 
@@ -32,7 +34,7 @@ class Level(IntEnum):
 def needed(scope: Mapping[str, Any]) -> Level:
     """What a request takes, by its ASGI scope."""
     path = scope["path"]
-    if path == ACT or path.startswith(f"{ACT}/"):
+    if path == ACT or path.startswith((f"{ACT}/", ALARM)):
         return Level.ACT
     if path in OPEN_PATHS or path.startswith(PAGE):
         return Level.NOTHING

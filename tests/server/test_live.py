@@ -26,7 +26,7 @@ from filter import FilterConfig
 from monitor import Monitor
 from server import live
 from server.app import create_app
-from server.keys import Keys
+from server.keys import Keys, Level, needed
 from server.live import Hub, Robot
 from server.observer import Answered
 from server.schema import ActRequest
@@ -346,11 +346,13 @@ def test_uplot_is_what_was_published() -> None:
         assert hashlib.sha256((PAGE / "uplot" / name).read_bytes()).hexdigest() == digest
 
 
-def test_the_files_need_no_key_and_the_stream_does(monitor: Monitor) -> None:
+def test_the_files_need_no_key_the_stream_and_an_acknowledgement_do(monitor: Monitor) -> None:
     app = TestClient(create_app(monitor, keys=Keys(act="secret")))
     assert app.get("/").status_code == 200
     assert app.get(f"/{addresses(app)[0]}").status_code == 200
     assert app.get("/live").status_code == 401
+    assert needed({"path": "/alarms/latency/acknowledge", "method": "POST"}) == Level.ACT
+    assert needed({"path": "/alarms", "method": "GET"}) == Level.READ
     assert app.head("/live", headers={"authorization": "Bearer secret"}).status_code == 200
 
 
