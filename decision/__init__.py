@@ -24,6 +24,7 @@ from decision.memory import (
     next_of_plan,
     remember_sent,
 )
+from decision.stopwatch import Stopwatch
 
 __all__ = [
     "HISTORY",
@@ -42,6 +43,7 @@ __all__ = [
     "Mode",
     "OpenedBy",
     "Origin",
+    "Stopwatch",
     "copy_of",
     "fall_back",
     "hazards_of_one",

@@ -20,6 +20,7 @@ from decision import (
     Mode,
     OpenedBy,
     Origin,
+    Stopwatch,
     fall_back,
     hazards_of_one,
     memory_of,
@@ -70,6 +71,7 @@ class Monitor:
     Attributes:
         faults: what went wrong so far.
         robot: the constants of the bundle's robot.
+        stopwatch: how long "inference" and "filter" took.
 
     Raises:
         MonitorError: for an unknown gate, a threshold that is not finite and >= 0 or stands beside a whole
@@ -92,6 +94,7 @@ class Monitor:
         self.robot = _robot(bundle)
         self.guide: Strength = guide
         self.faults = Faults()
+        self.stopwatch = Stopwatch()
         if isinstance(gate, Gate) and threshold is not None:
             raise MonitorError(f"threshold must be None beside a Gate, which has its own, got {threshold}")
         wanted = manifest.threshold if threshold is None else float(threshold)
@@ -150,9 +153,8 @@ class Monitor:
 
         A bad input or any fault inside gives mode "fallback" with the reason.
         """
-        lost = None
         try:
-            past = memory_of(1, memory)
+            past, lost = memory_of(1, memory), None
         except ValueError as error:
             past, lost = np.zeros(1, MEMORY), self._bad(error)
         try:
@@ -194,11 +196,9 @@ class Monitor:
         except Exception as error:  # noqa: BLE001 - whatever it is, the robot needs an action
             if len(observation) <= 1:
                 return self._fall_back(memory, self._note(error))
-        # Something in one row spoils the batch: decide one by one, so that only its own robot gets the
-        # fallback.
+        # Something in one row spoils the batch: one by one, only its own robot gets the fallback.
         rows = [slice(i, i + 1) for i in range(len(observation))]
-        near = [None if hazards is None else hazards[i] for i in rows]
-        alone = zip((observation[i] for i in rows), near, (memory[i] for i in rows), strict=True)
+        alone = [(observation[i], None if hazards is None else hazards[i], memory[i]) for i in rows]
         return Decisions.join([self._decide_or_fall_back(*robot) for robot in alone])
 
     def _decide(
@@ -213,7 +213,7 @@ class Monitor:
         acts = found.any and self.gate.name != "off"
         if acts:
             scene.doubt(found.doubted)
-        nominal, risk = self._networks.run(observation)
+        nominal, risk = self.stopwatch("inference", self._networks.run, observation)
         if nominal.shape != (len(observation), 2) or risk.shape != nominal.shape[:1]:
             raise NetworkError(f"the networks gave shapes {nominal.shape} and {risk.shape}")
         sound = np.empty(len(risk), np.bool_)
@@ -229,7 +229,7 @@ class Monitor:
             ahead = ~sound & ~scene.doubted
             asked, memory = np.where(sound[:, None], nominal, planned), np.where(ahead, after, memory)
         active = opened_by != ""
-        decided = self._filter.decide(scene, asked, memory, active)
+        decided = self.stopwatch("filter", self._filter.decide, scene, asked, memory, active)
         if decided.action is not asked or decided.mode.shape != active.shape:
             decided.check(asked, active, self._low, self._high)
         if acts:

@@ -1,4 +1,4 @@
-"""The HTTP service: `POST /act`, `POST /act/batch`, `/model`, `/healthz`, `/readyz`."""
+"""The HTTP service: decisions, what tells of itself, health checks, and what an operator asks and says."""
 
 from __future__ import annotations
 
@@ -10,15 +10,17 @@ from fastapi.responses import JSONResponse
 
 from monitor import Monitor
 from recorder import Recorder
+from server.change import Changer
+from server.console import add_console
 from server.desk import Desk
 from server.guard import ACT, BATCH, Guard
 from server.observer import Observer, Recording
+from server.operation import Operation
 from server.schema import MAX_ROBOTS, ActReply, ActRequest, BatchReply, ModelReply
+from server.states import NOT_READY
 
 MAX_BODY = 65536
 """Most bytes of a request's body: 60 numbers and a thousand hazards fit."""
-MANY_FAULTS = 5
-"""Internal faults within a minute from which on the service is not ready: a robot may live with one."""
 BATCH_BODY = 16
 """The body of a batch may be so many times as large."""
 
@@ -46,6 +48,9 @@ def create_app(
     api_key: str | None = None,
     max_body: int = MAX_BODY,
     recorder: Recorder | None = None,
+    operation: Operation | None = None,
+    changer: Changer | None = None,
+    admin_key: str | None = None,
 ) -> Guard:
     """The service around one monitor that is loaded and warmed up.
 
@@ -55,9 +60,14 @@ def create_app(
         api_key: the key that every request but the health checks must carry; None asks for none.
         max_body: most bytes of a request's body; a batch's may be `BATCH_BODY` times as large.
         recorder: what records the decisions, if any does.
+        operation: what an operator sees and says; by default one with the usual alarms.
+        changer: changes the bundle; None: nobody does.
+        admin_key: the key for hold, resume and another bundle; None: they are refused.
     """
     state = lifecycle or Lifecycle()
-    model = ModelReply.of(monitor)
+    watched = operation or Operation(monitor, recorder)
+    duty = watched.duty
+    model = duty.now.model
     # No /docs: its page loads scripts from other hosts. /openapi.json is there.
     app = FastAPI(
         title="Lagnet", description="What a watched robot policy does next.", docs_url=None, redoc_url=None
@@ -77,24 +87,30 @@ def create_app(
 
     @app.get("/model", response_model=ModelReply)
     async def about() -> ModelReply:
-        return model
+        return duty.now.model
 
     @app.get("/healthz")
     async def healthz() -> dict[str, Any]:
         # A service that can no longer record is alive, and says so.
-        return {"status": "alive"} | ({} if recorder is None else {"recording": recorder.status()})
+        told = {"status": "alive", "state": watched.states.state}
+        return told | ({} if recorder is None else {"recording": recorder.status()})
 
-    @app.get("/readyz", responses={503: {"description": "draining, or degraded by its own faults"}})
+    @app.get("/readyz", responses={503: {"description": "starting, degraded, draining or stopped"}})
     async def readyz() -> JSONResponse:
         if state.draining:
-            return JSONResponse({"status": "draining"}, status_code=503)
-        faults = monitor.faults.internal()
-        if faults >= MANY_FAULTS:
-            return JSONResponse({"status": "degraded", "internal_faults": faults}, status_code=503)
-        return JSONResponse({"status": "ready"})
+            watched.drain()
+        status = watched.tick()
+        return JSONResponse(
+            {"status": status, "why": watched.states.why}, 503 if status in NOT_READY else 200
+        )
 
-    observers: list[Observer] = [] if recorder is None else [Recording(recorder)]
-    return Guard(Desk(app, monitor, model, observers), api_key, max_body, {BATCH: BATCH_BODY * max_body})
+    observers: list[Observer] = [watched.tally]
+    if recorder is not None:
+        observers.append(Recording(recorder, model))
+    desk = Desk(app, duty, observers)
+    guard = Guard(desk, api_key, max_body, {BATCH: BATCH_BODY * max_body}, admin_key)
+    add_console(app, watched, changer, guard.refusals)
+    return guard
 
 
 def _act_schema(model: ModelReply) -> dict[str, Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import math
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -19,7 +20,7 @@ from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from decision import MEMORY, Decision, Memory, memory_from_json
-from monitor import Monitor
+from server.duty import Duty, OnDuty
 from server.guard import ACT, AT_ONCE, BATCH, BodyTooLargeError
 from server.observer import Answered, Observer
 from server.schema import ActRequest, BatchReply, BatchRequest, ModelReply, Refusal, Reply, reply_of
@@ -42,8 +43,14 @@ class Answer(NamedTuple):
     """The requests that were decided about, in order."""
     decisions: Sequence[Decision] = ()
     """What was decided about each."""
+    model: ModelReply | None = None
+    """What the one who decided tells of itself."""
+    begun: float = math.nan
+    """When that began, on the clock of `time.perf_counter` [s]."""
 
 
+Decided = tuple[BaseModel, list[ActRequest], list[Decision]]
+"""The reply, who was decided about, and what was decided."""
 Problem = tuple[list[str | int], str, str]
 """Where in the body, what is wrong, and its kind."""
 Validated = TypeVar("Validated", bound=BaseModel)
@@ -70,17 +77,13 @@ class Desk:
 
     Args:
         app: what answers the other paths.
-        monitor: what decides.
-        model: what it told of itself.
+        duty: who decides.
         observers: told of every answer, in order.
     """
 
-    def __init__(
-        self, app: ASGIApp, monitor: Monitor, model: ModelReply, observers: Sequence[Observer] = ()
-    ) -> None:
+    def __init__(self, app: ASGIApp, duty: Duty, observers: Sequence[Observer] = ()) -> None:
         self._app = app
-        self._monitor = monitor
-        self._model = model
+        self._duty = duty
         self._observers = observers
         self._thread = ThreadPoolExecutor(1, "decisions")
         self._quick = 0
@@ -94,10 +97,10 @@ class Desk:
             return
         started = time.perf_counter()
         content = b""
-        received = time.time_ns()
+        received, ready = time.time_ns(), started
         try:
             content = await _body(receive)
-            received = time.time_ns()
+            received, ready = time.time_ns(), time.perf_counter()
             if self._quick >= _QUICK_ENOUGH and scope["path"] == ACT:
                 answer = answers(content, started)
             else:
@@ -108,7 +111,8 @@ class Desk:
         if self._observers:
             seconds = time.perf_counter() - started
             client = scope.get("client")
-            answered = Answered(received, client, scope["path"], content, seconds, *answer)
+            queued = answer.begun - ready
+            answered = Answered(received, client, scope["path"], content, seconds, *answer[:-1], queued)
             for observer in self._observers:
                 observer.answered(answered)
         await _reply(scope, send, answer.status, answer.body)
@@ -120,32 +124,31 @@ class Desk:
     def _one(self, content: bytes, started: float) -> Answer:
         """Answers the body of `POST /act`."""
         begun = time.perf_counter()
-        answer = self._guarded(lambda: self._decide(content, started))
+        answer = self._guarded(lambda now: self._decide(now, content, started))
         self._quick = self._quick + 1 if time.perf_counter() - begun < _QUICK else 0
         return answer
 
     def _batch(self, content: bytes, started: float) -> Answer:
         """Answers the body of `POST /act/batch`."""
-        return self._guarded(lambda: self._decide_batch(content, started))
+        return self._guarded(lambda now: self._decide_batch(now, content, started))
 
-    def _guarded(self, decide: Callable[[], tuple[BaseModel, list[ActRequest], list[Decision]]]) -> Answer:
+    def _guarded(self, decide: Callable[[OnDuty], Decided]) -> Answer:
+        begun, now = time.perf_counter(), self._duty.now
         try:
-            reply, asked, decisions = decide()
-            return Answer(200, reply.model_dump_json().encode(), asked, decisions)
+            reply, asked, decisions = decide(now)
+            return Answer(200, reply.model_dump_json().encode(), asked, decisions, now.model, begun)
         except RefusedError as error:
             return _problem(422, error.errors)
         except Exception as error:  # noqa: BLE001 - counted and logged; the client has a fallback of its own
-            self._monitor.faults.note(type(error).__name__, "the decision could not be told", error)
+            now.monitor.faults.note(type(error).__name__, "the decision could not be told", error)
             return _problem(500, [([], "internal error", "internal")])
 
-    def _decide(self, content: bytes, started: float) -> tuple[BaseModel, list[ActRequest], list[Decision]]:
+    def _decide(self, now: OnDuty, content: bytes, started: float) -> Decided:
         asked, memory = self._read(lambda: ActRequest.model_validate_json(content))
-        decision = self._monitor.decide(asked.observation, asked.hazards, memory)
-        return self._told(decision, asked, started), [asked], [decision]
+        decision = now.decider.decide(asked.observation, asked.hazards, memory)
+        return self._told(now, decision, asked, started), [asked], [decision]
 
-    def _decide_batch(
-        self, content: bytes, started: float
-    ) -> tuple[BaseModel, list[ActRequest], list[Decision]]:
+    def _decide_batch(self, now: OnDuty, content: bytes, started: float) -> Decided:
         """One call of the monitor for all robots whose requests are in order; the others are told why not."""
         replies: list[Reply | Refusal] = []
         rows: list[tuple[int, ActRequest, Memory | None]] = []
@@ -158,7 +161,7 @@ class Desk:
             except RefusedError as error:
                 replies.append(Refusal(detail=_detail(error.errors)))
         if rows:
-            decisions = self._monitor.decide_batch(
+            decisions = now.decider.decide_batch(
                 np.array([asked.observation for _, asked, _ in rows]),
                 _hazards([asked.hazards or [] for _, asked, _ in rows]),
                 np.concatenate([np.zeros(1, MEMORY) if memory is None else memory for _, _, memory in rows]),
@@ -166,7 +169,7 @@ class Desk:
             most = max(len(asked.hazards or []) for _, asked, _ in rows)
             for row, (place, asked, _) in enumerate(rows):
                 decision = _of_its_own(decisions[row], len(asked.hazards or []), most)
-                replies[place] = self._told(decision, asked, started)
+                replies[place] = self._told(now, decision, asked, started)
                 told.append(decision)
         return BatchReply(replies=replies), [asked for _, asked, _ in rows], told
 
@@ -177,7 +180,7 @@ class Desk:
             RefusedError: if it cannot be decided about.
         """
         asked = _validated(validate)
-        size = self._model.observation_size
+        size = self._duty.now.model.observation_size
         if len(asked.observation) != size:
             message = f"must have {size} numbers, got {len(asked.observation)}"
             raise RefusedError([(["observation"], message, "wrong_length")])
@@ -186,9 +189,10 @@ class Desk:
         except ValueError as error:
             raise RefusedError([(["memory"], str(error), "wrong_memory")]) from error
 
-    def _told(self, decision: Decision, asked: ActRequest, started: float) -> Reply:
+    @staticmethod
+    def _told(now: OnDuty, decision: Decision, asked: ActRequest, started: float) -> Reply:
         seconds = time.perf_counter() - started
-        return reply_of(decision, asked.request, self._model.model, self._model.gate, seconds)
+        return reply_of(decision, asked.request, now.model.model, now.model.gate, seconds)
 
 
 def _validated(validate: Callable[[], Validated]) -> Validated:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hmac
 import json
+from collections import Counter
 from collections.abc import Mapping
 from contextlib import suppress
 from typing import Any
@@ -12,6 +13,9 @@ from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 ACT, BATCH = "/act", "/act/batch"
+MODEL, HOLD, RESUME = "/model", "/hold", "/resume"
+ADMIN_PATHS = frozenset({MODEL, HOLD, RESUME})
+"""Whoever posts there needs the admin key, and is refused where there is none."""
 OPEN_PATHS = frozenset({"/healthz", "/readyz"})
 """What an orchestrator may ask without a key."""
 AT_ONCE = "lagnet.at_once"
@@ -27,18 +31,29 @@ class BodyTooLargeError(ValueError):
 
 
 class Guard:
-    """Refuses requests without the key (401), without a place (503) and with a body above the limit (413).
+    """Refuses requests without the key (401, 403), without a place (503) and with too large a body (413).
 
     Args:
         app: what it guards.
         api_key: the key that `Authorization: Bearer KEY` or `X-API-Key: KEY` must carry; None asks for none.
         max_body: most bytes of a request's body.
         larger: path → most bytes of a body there, where that is more.
+        admin_key: the key for `ADMIN_PATHS`, which serves everywhere else as well; None: they are refused.
+
+    Attributes:
+        refusals: status → requests refused here.
     """
 
     def __init__(
-        self, app: ASGIApp, api_key: str | None, max_body: int, larger: Mapping[str, int] | None = None
+        self,
+        app: ASGIApp,
+        api_key: str | None,
+        max_body: int,
+        larger: Mapping[str, int] | None = None,
+        admin_key: str | None = None,
     ) -> None:
+        self.refusals: Counter[int] = Counter()
+        self._admin_key = None if admin_key is None else admin_key.encode()
         self._app = app
         self._key = None if api_key is None else api_key.encode()
         self._max_body = max_body
@@ -51,16 +66,19 @@ class Guard:
             return
         headers: dict[bytes, bytes] = dict(scope["headers"])
         if scope["path"] not in OPEN_PATHS and not self._admits(headers):
-            await _refuse(send, 401, "header", "authorization", "a valid API key is required")
+            await self._refuse(send, 401, "header", "authorization", "a valid API key is required")
+            return
+        if scope["path"] in ADMIN_PATHS and scope["method"] == "POST" and not self._is_admins(headers):
+            await self._refuse(send, 403, "header", "authorization", "the admin key is required")
             return
         if scope["path"] in (ACT, BATCH) and scope.get("extensions", {}).get(FULL):
-            await _refuse(send, 503, "connection", "limit", "every connection awaits its answer")
+            await self._refuse(send, 503, "connection", "limit", "every connection awaits its answer")
             return
         max_body = self._larger.get(scope["path"], self._max_body)
         stated = headers.get(b"content-length", b"")
         # int() refuses thousands of digits.
         if stated.isdigit() and (len(stated) > _MAX_DIGITS or int(stated) > max_body):
-            await _refuse(send, 413, "body", "content-length", _too_large(max_body))
+            await self._refuse(send, 413, "body", "content-length", _too_large(max_body))
             return
         if not stated.isdigit() or b"transfer-encoding" in headers:
             receive = _limited(receive, max_body)
@@ -73,7 +91,14 @@ class Guard:
         return scope["path"] in (ACT, BATCH) and self._admits(dict(scope["headers"]))
 
     def _admits(self, headers: Mapping[bytes, bytes]) -> bool:
-        return self._key is None or _carries(headers, self._key)
+        return self._key is None or _carries(headers, self._key) or self._is_admins(headers)
+
+    def _is_admins(self, headers: Mapping[bytes, bytes]) -> bool:
+        return self._admin_key is not None and _carries(headers, self._admin_key)
+
+    async def _refuse(self, send: Send, status: int, place: str, name: str, message: str) -> None:
+        self.refusals[status] += 1
+        await _refuse(send, status, place, name, message)
 
 
 def _too_large(max_body: int) -> str:

@@ -8,10 +8,11 @@ import ipaddress
 import json
 import math
 import os
+import signal
 import socket
 import sys
 import time
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import FrameType
@@ -25,13 +26,19 @@ from filter import FilterConfig
 from models import BundleError
 from monitor import DEFAULT_STRENGTH, GateName, Monitor, MonitorError, Strength
 from recorder import Recorder, RecordingError, Settings
+from server.alarms import AlarmsError, read_rules
 from server.app import MAX_BODY, Lifecycle, create_app
+from server.change import ChangeError, Changer
 from server.door import Connection, Door, Patience
+from server.events import Events, Form
 from server.guard import Guard
+from server.operation import Operation
 from server.schema import ModelReply
 
 KEY_VARIABLE = "LAGNET_API_KEY"
 """Environment variable that may hold the key."""
+ADMIN_KEY_VARIABLE = "LAGNET_ADMIN_KEY"
+"""Environment variable that may hold the admin key."""
 _OTHER_FILES = 64
 """Files that are open beside the connections."""
 LEAST_FILE = 4.0
@@ -97,6 +104,16 @@ class ServeConfig:
     """Folder for the last 30 s before every fallback or alarm; by default that of --record."""
     incidents_mb: float = 256.0
     """Size of all files of incidents in it [MB]; where they come to more, the oldest go."""
+    alarms: Path | None = None
+    """TOML file with settings of alarms that are to be other than usual."""
+    log: Form = "text"
+    """How events are told on standard error: warnings and errors as text, or all of them as JSON, a line
+    each."""
+    admin_key_file: Path | None = None
+    """File that holds the key for hold, resume and another bundle; otherwise the environment variable
+    LAGNET_ADMIN_KEY. Without one these are refused."""
+    bundles: Path | None = None
+    """Folder with other bundles, which POST /model may change to. SIGHUP loads the service's own anew."""
 
     def filter_config(self) -> FilterConfig:
         """The filter's settings, or ServeError for one that is out of its range."""
@@ -120,6 +137,8 @@ class ServeConfig:
         if not (math.isfinite(self.drain_seconds) and self.drain_seconds >= 0.0):
             raise ServeError(f"--drain-seconds must be finite and at least 0, got {self.drain_seconds}")
         self._check_recording()
+        if self.bundles is not None and not self.bundles.is_dir():
+            raise ServeError(f"--bundles {self.bundles}: no such folder")
 
     def _check_recording(self) -> None:
         sizes = (
@@ -157,6 +176,8 @@ class DrainingServer(uvicorn.Server):
         drain_seconds: how long it says so [s].
         announcement: a line for stdout, written once it listens and stops in order when told to.
         door: who may stay connected.
+        operation: looked at ten times a second.
+        changer: loads the bundle anew on SIGHUP.
     """
 
     def __init__(
@@ -166,8 +187,13 @@ class DrainingServer(uvicorn.Server):
         drain_seconds: float,
         announcement: str,
         door: Door,
+        operation: Operation | None = None,
+        changer: Changer | None = None,
     ) -> None:
         super().__init__(config)
+        self._operation = operation
+        self._changer = changer
+        self._change: asyncio.Task[None] | None = None
         self.server_state = self._door = door
         self._lifecycle = lifecycle
         self._drain_seconds = drain_seconds
@@ -177,6 +203,8 @@ class DrainingServer(uvicorn.Server):
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Starts to listen, and says so."""
         await super().startup(sockets)
+        if self._changer is not None and hasattr(signal, "SIGHUP"):
+            asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, self._on_hangup, self._changer)
         sys.stdout.write(self._announcement + "\n")
         sys.stdout.flush()
 
@@ -190,9 +218,21 @@ class DrainingServer(uvicorn.Server):
     async def on_tick(self, counter: int) -> bool:
         """Asked ten times a second whether to stop."""
         self._door.sweep(asyncio.get_running_loop().time())
+        if self._operation is not None:
+            # Not in the signal's handler: it may come in the middle of anything.
+            if self._lifecycle.draining:
+                self._operation.drain()
+            self._operation.tick()
         if self._stop_at is not None and time.monotonic() >= self._stop_at:
             self.should_exit = True
         return await super().on_tick(counter)
+
+    def _on_hangup(self, changer: Changer) -> None:
+        async def again() -> None:
+            with suppress(ChangeError):  # it was told
+                await changer.again()
+
+        self._change = asyncio.get_running_loop().create_task(again())
 
 
 def listen(host: str, port: int, api_key: str | None) -> socket.socket:
@@ -220,16 +260,16 @@ def listen(host: str, port: int, api_key: str | None) -> socket.socket:
     return listener
 
 
-def read_api_key(path: Path | None) -> str | None:
+def read_api_key(path: Path | None, variable: str = KEY_VARIABLE, flag: str = "--api-key-file") -> str | None:
     """The key from a file, else from the environment, else None.
 
     Raises:
         ServeError: if the file cannot be read, or the key is empty or not printable ASCII.
     """
     try:
-        key = os.environ.get(KEY_VARIABLE) if path is None else path.read_text(encoding="utf-8").strip()
+        key = os.environ.get(variable) if path is None else path.read_text(encoding="utf-8").strip()
     except (OSError, UnicodeDecodeError) as error:
-        raise ServeError(f"--api-key-file {path}: cannot be read: {error}") from error
+        raise ServeError(f"{flag} {path}: cannot be read: {error}") from error
     if key is None:
         return None
     if not key or not all("!" <= letter <= "~" for letter in key):
@@ -262,30 +302,40 @@ def serve(config: ServeConfig) -> None:
 
     Raises:
         ServeError: for settings or an address that cannot be had.
+        AlarmsError: for settings of alarms that cannot be used.
         BundleError: if the bundle must not be used.
         MonitorError: if it cannot be run with these settings.
         RecordingError: if it cannot be recorded.
     """
     config.check()
     api_key = read_api_key(config.api_key_file)
+    admin_key = read_api_key(config.admin_key_file, ADMIN_KEY_VARIABLE, "--admin-key-file")
+    rules = read_rules(config.alarms)
     allow_files(config.max_connections)
     listener = listen(config.host, config.port, api_key)
     with listener:
-        monitor = Monitor.load(
-            config.bundle, config.gate, config.threshold, config.filter_config(), config.guide
-        )
+
+        def load(bundle: Path) -> Monitor:
+            return Monitor.load(bundle, config.gate, config.threshold, config.filter_config(), config.guide)
+
+        monitor = load(config.bundle)
         lifecycle = Lifecycle()
         host, port = listener.getsockname()[:2]
         url = f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
         ready = {"event": "listening", "url": url, "host": host, "port": port, "model": monitor.bundle.id}
         gate = {"gate": monitor.gate.name, "threshold": monitor.gate.threshold, "guide": config.guide}
         announcement = json.dumps(ready | gate)
-        with recorder_of(config, monitor) as recorder:
-            app = create_app(monitor, lifecycle, api_key, config.max_body, recorder)
+        with Events(config.log) as events, recorder_of(config, monitor) as recorder:
+            operation = Operation(monitor, recorder, rules, events)
+            changer = Changer(operation, load, config.bundle, config.bundles)
+            app = create_app(
+                monitor, lifecycle, api_key, config.max_body, recorder, operation, changer, admin_key
+            )
             # What is loaded stays: looking through it again and again for garbage would hold up decisions.
             gc.collect()
             gc.freeze()
-            _server(app, lifecycle, config, announcement).run(sockets=[listener])
+            _server(app, lifecycle, config, announcement, operation, changer).run(sockets=[listener])
+            operation.stop()
 
 
 def recorder_of(config: ServeConfig, monitor: Monitor) -> AbstractContextManager[Recorder | None]:
@@ -300,10 +350,18 @@ def recorder_of(config: ServeConfig, monitor: Monitor) -> AbstractContextManager
     return Recorder(wanted, ModelReply.of(monitor).model_dump(), asdict(config.filter_config()))
 
 
-def _server(app: Guard, lifecycle: Lifecycle, config: ServeConfig, announcement: str) -> DrainingServer:
+def _server(
+    app: Guard,
+    lifecycle: Lifecycle,
+    config: ServeConfig,
+    announcement: str,
+    operation: Operation,
+    changer: Changer,
+) -> DrainingServer:
     settings = uvicorn.Config(
         app,
         access_log=False,
+        log_config=None,  # `Events` tells what it logs
         log_level="error",  # warnings are of what anybody may send, a line each
         lifespan="off",
         ws="none",
@@ -314,12 +372,12 @@ def _server(app: Guard, lifecycle: Lifecycle, config: ServeConfig, announcement:
     )
     patience = Patience(config.read_seconds, config.idle_seconds, config.max_connections)
     door = Door(patience, app.is_robots)
-    return DrainingServer(settings, lifecycle, config.drain_seconds, announcement, door)
+    return DrainingServer(settings, lifecycle, config.drain_seconds, announcement, door, operation, changer)
 
 
 def main() -> None:
     """Entry point of `lagnet-serve`: exit status 0 after an orderly stop, 2 if it could not start."""
-    with command("lagnet-serve", ServeError, BundleError, MonitorError, RecordingError):
+    with command("lagnet-serve", ServeError, AlarmsError, BundleError, MonitorError, RecordingError):
         serve(settings(ServeConfig, "lagnet-serve"))
 
 
