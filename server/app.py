@@ -17,7 +17,7 @@ from server.guard import ACT, BATCH, Guard
 from server.observer import Observer, Recording
 from server.operation import Operation
 from server.schema import MAX_ROBOTS, ActReply, ActRequest, BatchReply, ModelReply
-from server.states import NOT_READY
+from server.states import NOT_READY, State
 
 MAX_BODY = 65536
 """Most bytes of a request's body: 60 numbers and a thousand hazards fit."""
@@ -100,9 +100,8 @@ def create_app(
         if state.draining:
             watched.drain()
         status = watched.tick()
-        return JSONResponse(
-            {"status": status, "why": watched.states.why}, 503 if status in NOT_READY else 200
-        )
+        told = {"why": watched.states.why} if status in (State.DEGRADED, State.HOLD) else {}
+        return JSONResponse({"status": status} | told, 503 if status in NOT_READY else 200)
 
     observers: list[Observer] = [watched.tally]
     if recorder is not None:

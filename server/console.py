@@ -17,7 +17,12 @@ from server.operation import HeldError, Operation
 from server.schema import ModelReply
 from server.states import TransitionError
 
-_REFUSED: dict[int | str, dict[str, Any]] = {409: {"description": "not possible now; says why"}}
+_REFUSED: dict[int | str, dict[str, Any]] = {
+    400: {"description": "the body is no text"},
+    401: {"description": "no valid key"},
+    403: {"description": "not the admin key"},
+    409: {"description": "not possible now; says why"},
+}
 _MOST_ERRORS = 8
 
 Text = Annotated[str, Field(strict=True, min_length=1, max_length=200)]
