@@ -108,14 +108,15 @@ class Desk:
                 answer = await loop.run_in_executor(self._thread, answers, content, started)
         except BodyTooLargeError as error:
             answer = _problem(413, [([], str(error), "too_large")])
-        if self._observers:
-            seconds = time.perf_counter() - started
-            client = scope.get("client")
-            queued = answer.begun - ready
+        seconds = time.perf_counter() - started
+        try:
+            await _reply(scope, send, answer.status, answer.body)
+        finally:
+            # Once the reply is on its way: a robot waits for nobody who looks on.
+            client, queued = scope.get("client"), answer.begun - ready
             answered = Answered(received, client, scope["path"], content, seconds, *answer[:-1], queued)
             for observer in self._observers:
                 observer.answered(answered)
-        await _reply(scope, send, answer.status, answer.body)
 
     def answer(self, content: bytes, batch: bool) -> Answer:
         """The answer to the body of a `POST /act`, or of a `POST /act/batch`."""

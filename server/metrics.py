@@ -79,11 +79,12 @@ class _Metrics(Collector):
 
     def _decisions(self) -> Iterable[Metric]:
         tally = self._operation.tally
-        modes = {mode: tally.modes[mode] for mode in Mode}
+        all_modes, all_origins, all_opened = tally.modes, tally.origins, tally.opened
+        modes = {mode: all_modes[mode] for mode in Mode}
         yield _counter("decisions", "Decisions by what became of the nominal action.", "mode", modes)
-        opened = {str(cause): tally.opened[cause] for cause in OpenedBy} | {"closed": tally.opened[""]}
+        opened = {str(cause): all_opened[cause] for cause in OpenedBy} | {"closed": all_opened[None]}
         yield _counter("gate", "Decisions by what opened the gate.", "opened_by", opened)
-        origins = {origin: tally.origins[origin] for origin in Origin}
+        origins = {origin: all_origins[origin] for origin in Origin}
         yield _counter("interventions", "Actions that are not the nominal one.", "origin", origins)
         fallbacks = {kind: tally.fallbacks[kind] for kind in REASONS}
         yield _counter("fallbacks", "Decisions in mode fallback by kind of reason.", "reason", fallbacks)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from decision import Decision
 from recorder import Recorder
@@ -15,8 +14,7 @@ _RECORDED = (200, 500)
 """The statuses of decisions, and of those that could not be told."""
 
 
-@dataclass(frozen=True, slots=True)
-class Answered:
+class Answered(NamedTuple):
     """A request for decisions, and its answer.
 
     Attributes:
@@ -47,7 +45,7 @@ class Answered:
 
 
 class Observer(Protocol):
-    """Is told of every answer, in the event loop's thread and before it is sent: it must be quick."""
+    """Is told of every answer, in the event loop's thread and once it is on its way: it must be quick."""
 
     def answered(self, answered: Answered) -> None:
         """Takes note of one request and its answer, refusals included."""

@@ -168,14 +168,15 @@ class Operation:
         chattering = {"chattering": True} if alarm.chatters(time.monotonic()) else {}
         told = {"value": alarm.value, "limit": alarm.rule.limit, "cause": alarm.cause} | chattering
         self.events.tell("alarm", "warning" if set_ else "info", alarm=name, state=alarm.standing, **told)
-        if set_ and self.recorder is not None:
+        # What no longer records, or hardly does, is not asked to.
+        if set_ and name != "recorder" and self.recorder is not None:
             self.recorder.incident(f"alarm {name}: {alarm.cause}")
 
     def _mark(self, now: float) -> _Mark:
         tally = self.tally
         decisions = tally.decisions
         fallbacks = sum(tally.fallbacks.values()) - tally.fallbacks[HELD]
-        opened = decisions - tally.opened[""]
+        opened = decisions - tally.opened[None]
         requests = tally.seconds["request"].counts
         return _Mark(now, decisions, tally.risky, tally.novel, fallbacks, opened, list(requests))
 

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import accumulate
 from math import inf
+from typing import TypeVar
 
-from decision import Decision, Mode
+from decision import Decision, Mode, OpenedBy, Origin
 from server.duty import HELD, Duty
 from server.observer import Answered
 
@@ -26,6 +27,9 @@ BARRIERS = (-0.2, -0.1, -0.05, -0.02, 0.0, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 
 """Bounds of barriers [m]: up to 0.0 is not safe."""
 NOVELTIES = (0.1, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 5.0, 10.0)
 
+Key = TypeVar("Key")
+
+_FALLBACK = Mode.FALLBACK
 _KINDS = (
     (f"{HELD}:", HELD),
     ("deadline", "deadline"),
@@ -48,6 +52,13 @@ REASONS = (*dict.fromkeys(kind for _, kind in _KINDS), OTHER)
 def kind_of(reason: str | None) -> str:
     """The kind of a fallback's reason, one of `REASONS`: the texts themselves name numbers and files."""
     return next((kind for text, kind in _KINDS if text in (reason or "")), OTHER)
+
+
+def _summed(counts: Iterable[tuple[Key, int]]) -> Counter[Key]:
+    total: Counter[Key] = Counter()
+    for key, count in counts:
+        total[key] += count
+    return total
 
 
 class Histogram:
@@ -101,9 +112,7 @@ class Tally:
 
     Attributes:
         requests: path and status → answers.
-        modes: decisions by mode.
-        opened: decisions by what opened the gate; "" where it was closed.
-        origins: interventions by origin.
+        outcomes: mode, origin and what opened the gate → decisions.
         fallbacks: decisions in mode "fallback" by kind of reason.
         risky: decisions whose risk score was above the threshold.
         novel: decisions with a novelty above 1.
@@ -114,9 +123,7 @@ class Tally:
     def __init__(self, duty: Duty) -> None:
         self._duty = duty
         self.requests: Counter[tuple[str, int]] = Counter()
-        self.modes: Counter[str] = Counter()
-        self.opened: Counter[str] = Counter()
-        self.origins: Counter[str] = Counter()
+        self.outcomes: Counter[tuple[Mode, Origin | None, OpenedBy | None]] = Counter()
         self.fallbacks: Counter[str] = Counter()
         self.risky = self.novel = 0
         self.seconds = {name: Histogram(SECONDS) for name in ("request", "queue", "inference", "filter")}
@@ -125,7 +132,22 @@ class Tally:
     @property
     def decisions(self) -> int:
         """How many decisions there were."""
-        return sum(self.modes.values())
+        return sum(self.outcomes.values())
+
+    @property
+    def modes(self) -> Counter[Mode]:
+        """Decisions by mode."""
+        return _summed((mode, count) for (mode, _, _), count in self.outcomes.items())
+
+    @property
+    def origins(self) -> Counter[Origin | None]:
+        """Decisions by what the action came from; None for the nominal one."""
+        return _summed((origin, count) for (_, origin, _), count in self.outcomes.items())
+
+    @property
+    def opened(self) -> Counter[OpenedBy | None]:
+        """Decisions by what opened the gate; None where it was closed."""
+        return _summed((cause, count) for (_, _, cause), count in self.outcomes.items())
 
     def answered(self, answered: Answered) -> None:
         """Counts one request and its answer."""
@@ -141,17 +163,14 @@ class Tally:
             self._decided(decision)
 
     def _decided(self, decision: Decision) -> None:
-        self.modes[decision.mode] += 1
-        self.opened[decision.opened_by or ""] += 1
+        self.outcomes[decision.mode, decision.origin, decision.opened_by] += 1
         self.risky += decision.risk > decision.threshold
         self.novel += decision.novelty > 1.0
         self.risk.add(decision.risk)
         self.barrier.add(decision.barrier)
         self.novelty.add(decision.novelty)
-        if decision.origin is not None:
-            self.origins[decision.origin] += 1
-            if decision.mode is Mode.FALLBACK:
-                self.fallbacks[kind_of(decision.reason)] += 1
+        if decision.mode is _FALLBACK:
+            self.fallbacks[kind_of(decision.reason)] += 1
 
     def counters(self) -> dict[str, int | dict[str, int]]:
         """What was counted, as plain JSON."""
@@ -162,8 +181,8 @@ class Tally:
             "decisions": self.decisions,
             "requests": dict(statuses),
             "modes": {str(mode): count for mode, count in self.modes.items()},
-            "opened_by": {str(cause) or "closed": count for cause, count in self.opened.items()},
-            "origins": {str(origin): count for origin, count in self.origins.items()},
+            "opened_by": {str(cause or "closed"): count for cause, count in self.opened.items()},
+            "origins": {str(origin): count for origin, count in self.origins.items() if origin},
             "fallbacks": dict(self.fallbacks),
             "risky": self.risky,
             "novel": self.novel,
