@@ -154,16 +154,16 @@ class BarrierFilter:
             programme.solve(self._solver)
             rows, action = programme.rows, programme.action()
             done = programme.solved & step.certify(rows, action, step.need[rows])
-            for origin, which in (
-                (Origin.CIRCULATION, done & programme.circulates),
-                (Origin.BARRIER, done & ~programme.circulates),
-            ):
-                step.send(rows[which], action[which], Mode.FILTERED, origin)
+            step.send(rows[done], action[done], Mode.FILTERED, Origin.BARRIER)
+            circled = done & programme.circulates
+            step.send(rows[circled], action[circled], Mode.FILTERED, Origin.CIRCULATION)
             programme.keep(~done)
         return programme.rows
 
     def _by_search(self, step: Step, rows: IntArray) -> IntArray:
         """Send the certified action nearest to the reference, of those that are tried; the rows left."""
+        if not rows.size:
+            return rows
         found = step.search(rows)
         done: BoolArray = step.certificates["clearance"][rows] >= step.need[rows]
         step.send(rows[done], found[done], Mode.FILTERED, Origin.SEARCH)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from decision import MOST_LATE
 from filter.certificate import CERTIFICATE
 from filter.certificate import certify as certify_one
-from filter.circulation import circulate
+from filter.circulation import SIDE_STEPS, circulate
 from filter.config import Settings
 from filter.qp import after, barrier_rows
 from filter.recovery import commit, drive_out
@@ -235,21 +235,23 @@ def add_circulation(
     rows: IntArray,
     nearest: IntArray,
     reference: FloatArray,
-    side: NDArray[np.int8],
+    asked: BoolArray,
+    memory: Records,
     G: FloatArray,
     h: FloatArray,
     count: IntArray,
 ) -> None:
     """Write the circulation row behind the rows of QPs; ``count`` stays.
 
-    ``nearest`` (n,) is the obstacle that refuses the ``reference`` (n, 2) of the QP, ``side`` (n,) the
-    remembered side, 1, -1 or 0, which the new one overwrites.
+    ``nearest`` (n,) is the obstacle that refuses the ``reference`` (n, 2) of the QP. The side that is
+    remembered in ``memory`` (N,) becomes the new one where the row is ``asked`` for (n,).
     """
-    config = settings[0]
     for j in range(len(rows)):
         k = rows[j]
-        way = circulate(config, obstacles[k, nearest[j]], _state(seen[k]), reference[j], side[j])
-        side[j] = way[0]
+        side = (memory[k].side > 0) - (memory[k].side < 0)
+        way = circulate(settings[0], obstacles[k, nearest[j]], _state(seen[k]), reference[j], side)
+        if asked[j]:
+            memory[k].side = way[0] * SIDE_STEPS
         G[j, count[j]] = (0.0, -1.0 if way[1] >= 0.0 else 1.0)
         h[j, count[j]] = -abs(way[1])
 

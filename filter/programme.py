@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from filter import kernel
-from filter.circulation import SIDE_STEPS
 from filter.qp import Problem
 from filter.solvers import Solver, solve_batch
 from filter.step import Step
@@ -52,9 +51,8 @@ class Programme:
         about = self._x.copy()
         seen = (step.settings, scene.seen, scene.obstacles, self.rows)
         kernel.linearise(*seen, about, trust, self._G, self._h, self._count)
-        side = np.sign(step.memory["side"][self.rows])
-        kernel.add_circulation(*seen, self._nearest, self.reference, side, self._G, self._h, self._count)
-        step.memory["side"][self.rows[self._circulating]] = side[self._circulating] * SIDE_STEPS
+        asked = self._nearest, self.reference, self._circulating, step.memory
+        kernel.add_circulation(*seen, *asked, self._G, self._h, self._count)
 
     def solve(self, solver: Solver) -> None:
         """Solve them: with the circulation row where there is a solution, else by the barrier rows alone."""

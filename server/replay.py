@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+import textwrap
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -220,10 +221,10 @@ def _draw(picture: Path, timeline: Timeline, reader: Reader, config: ReplayConfi
     from recorder.picture import draw
 
     robot = timeline.of_most_interest() if config.robot is None else config.robot
-    what = "" if reader.incident is None else f"{reader.incident['reason']} — "
-    title = f"{what[:90]}robot {robot} of {len(timeline.robots())}, {_utc(timeline.zero)}"
+    what = "" if reader.incident is None else textwrap.shorten(reader.incident["reason"], 120) + "\n"
+    title = f"{what}robot {robot}, one of {len(timeline.robots())}, {_utc(timeline.zero)}"
     try:
-        draw(picture, timeline, robot, title)
+        draw(picture, timeline, robot, title, reader.model.get("action_high", (1.0, 1.0)))
     except ImportError:
         console.print("no picture: matplotlib is not installed (pip install 'lagnet[train]')", style="yellow")
     except OSError as error:
