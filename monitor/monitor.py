@@ -161,7 +161,7 @@ class Monitor:
             row = np.array(observation, dtype=np.float64)[None]
             given = None if hazards is None else hazards_of_one(hazards)
         except (TypeError, ValueError) as error:
-            return self._fall_back(past, self._bad(error))[0]
+            return self.fall_back(past, self._bad(error))[0]
         return self._decide_or_fall_back(row, given, past, lost)[0]
 
     def decide_batch(
@@ -195,11 +195,15 @@ class Monitor:
             return self._decide(observation, hazards, memory, lost)
         except Exception as error:  # noqa: BLE001 - whatever it is, the robot needs an action
             if len(observation) <= 1:
-                return self._fall_back(memory, self._note(error))
+                return self.fall_back(memory, self._note(error))
         # Something in one row spoils the batch: one by one, only its own robot gets the fallback.
         rows = [slice(i, i + 1) for i in range(len(observation))]
         alone = [(observation[i], None if hazards is None else hazards[i], memory[i]) for i in rows]
         return Decisions.join([self._decide_or_fall_back(*robot) for robot in alone])
+
+    def fall_back(self, memory: Memory, reason: str) -> Decisions:
+        """The fallback of N robots with this memory (N,): their plans, then the bundle's safe action."""
+        return fall_back(memory, reason, self.gate.threshold, self._safe)
 
     def _decide(
         self, observation: FloatArray, hazards: FloatArray | None, memory: Memory, lost: str | None
@@ -294,18 +298,14 @@ class Monitor:
         self.faults.note("bad input", str(error))
         return f"bad input: {error}"
 
-    def _fall_back(self, memory: Memory, reason: str) -> Decisions:
-        return fall_back(memory, reason, self.gate.threshold, self._safe)
-
     def _warm_up(self) -> None:
         """Runs every part once, or raises MonitorError if not even a robot at rest can be decided about."""
         blocks = layout(self.bundle.manifest.level)
         at_rest = np.zeros((1, blocks.size))
         at_rest[:, blocks.slice("accelerometer")] = (0.0, 0.0, 9.81)
         at_rest[:, blocks.slice("magnetometer")] = (0.0, -0.5, 0.0)
-        decision = self.decide(at_rest[0])
-        if decision.reason is not None:
-            raise MonitorError(f"{self.bundle.path}: cannot decide about a robot at rest: {decision.reason}")
+        if (why := self.decide(at_rest[0]).reason) is not None:
+            raise MonitorError(f"{self.bundle.path}: cannot decide about a robot at rest: {why}")
         asked = np.clip([[1.0, 0.0]], self._low, self._high)
         for speed, distance in product((1.0, 0.5, 0.0), (1.0, 0.7, 0.5, 0.3, 0.24, 0.22, 0.1)):
             at_rest[:, blocks.slice("velocimeter")] = (speed, 0.0, 0.0)

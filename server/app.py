@@ -13,9 +13,13 @@ from recorder import Recorder
 from server.change import Changer
 from server.console import add_console
 from server.desk import Desk
-from server.guard import ACT, BATCH, Guard
+from server.freshness import Freshness
+from server.guard import Guard
+from server.keys import ACT, BATCH, Keys
 from server.observer import Observer, Recording
 from server.operation import Operation
+from server.robots import RESET, robots_router
+from server.safety import Safety
 from server.schema import MAX_ROBOTS, ActReply, ActRequest, BatchReply, ModelReply
 from server.states import NOT_READY, State
 
@@ -24,10 +28,18 @@ MAX_BODY = 65536
 BATCH_BODY = 16
 """The body of a batch may be so many times as large."""
 
-_ERRORS: dict[int | str, dict[str, Any]] = {
+_REFUSALS: dict[int | str, dict[str, Any]] = {
+    401: {"description": "no valid key"},
+    403: {"description": "a key for less than this"},
     413: {"description": "body too large"},
+}
+_ACT_LINKS: dict[int | str, dict[str, Any]] = {
+    200: {"links": {"reset": {"operationId": RESET, "parameters": {"name": "$request.body#/robot"}}}}
+}
+_ERRORS: dict[int | str, dict[str, Any]] = _REFUSALS | {
     422: {"description": "names the field that is wrong"},
     500: {"description": "the decision could not be told"},
+    503: {"description": "overloaded; Retry-After says when to try again"},
 }
 
 
@@ -45,26 +57,30 @@ class Lifecycle:
 def create_app(
     monitor: Monitor,
     lifecycle: Lifecycle | None = None,
-    api_key: str | None = None,
+    keys: Keys | None = None,
     max_body: int = MAX_BODY,
     recorder: Recorder | None = None,
     operation: Operation | None = None,
     changer: Changer | None = None,
-    admin_key: str | None = None,
+    safety: Safety | None = None,
+    freshness: Freshness | None = None,
 ) -> Guard:
     """The service around one monitor that is loaded and warmed up.
 
     Args:
         monitor: what decides.
         lifecycle: shared with whoever stops the service.
-        api_key: the key that every request but the health checks must carry; None asks for none.
+        keys: those that every request but the health checks must carry one of; None asks for none.
         max_body: most bytes of a request's body; a batch's may be `BATCH_BODY` times as large.
         recorder: what records the decisions, if any does.
         operation: what an operator sees and says; by default one with the usual alarms.
         changer: changes the bundle; None: nobody does.
-        admin_key: the key for hold, resume and another bundle; None: they are refused.
+        safety: the limits within which it decides.
+        freshness: shared with whoever looks for silent robots; by default one within `safety.freshness`.
     """
     state = lifecycle or Lifecycle()
+    limits = safety or Safety()
+    known = freshness or Freshness(limits.freshness, monitor.faults.note)
     watched = operation or Operation(monitor, recorder)
     duty = watched.duty
     model = duty.now.model
@@ -75,7 +91,12 @@ def create_app(
 
     # These two document their paths; `Desk` answers them before FastAPI is asked, at a third of the cost, and
     # with errors that name the field without repeating the input, which may be NaN.
-    @app.post(ACT, response_model=ActReply, responses=_ERRORS, openapi_extra=_body_of(_act_schema(model)))
+    @app.post(
+        ACT,
+        response_model=ActReply,
+        responses=_ERRORS | _ACT_LINKS,
+        openapi_extra=_body_of(_act_schema(model)),
+    )
     async def act() -> None:
         raise NotImplementedError
 
@@ -106,8 +127,9 @@ def create_app(
     observers: list[Observer] = [watched.tally]
     if recorder is not None:
         observers.append(Recording(recorder, model))
-    desk = Desk(app, duty, observers)
-    guard = Guard(desk, api_key, max_body, {BATCH: BATCH_BODY * max_body}, admin_key)
+    app.include_router(robots_router(known, _REFUSALS))
+    desk = Desk(app, duty, observers, limits, known)
+    guard = Guard(desk, keys or Keys(), max_body, {BATCH: BATCH_BODY * max_body})
     add_console(app, watched, changer, guard.refusals)
     return guard
 
@@ -117,6 +139,9 @@ def _act_schema(model: ModelReply) -> dict[str, Any]:
     schema = ActRequest.model_json_schema()
     size = model.observation_size
     schema["properties"]["observation"] |= {"minItems": size, "maxItems": size}
+    # In place: a document has its definitions elsewhere, and a reply's memory is not quite a request's.
+    kinds = schema["properties"]["memory"]["anyOf"]
+    kinds[0] = schema.pop("$defs")[kinds[0]["$ref"].rpartition("/")[2]]
     return schema
 
 

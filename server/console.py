@@ -9,10 +9,11 @@ from fastapi import FastAPI, HTTPException, Request, Response
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ConfigDict, Field
+from starlette.routing import Match
 
 from server import metrics
 from server.change import BusyError, ChangeError, Changer
-from server.guard import HOLD, MODEL, RESUME
+from server.keys import ALARMS, HOLD, MODEL, RESUME
 from server.operation import HeldError, Operation
 from server.schema import ModelReply
 from server.states import TransitionError
@@ -116,6 +117,13 @@ def add_console(
         ]
         return JSONResponse({"detail": detail}, 422)
 
+    @app.exception_handler(405)
+    async def not_allowed(request: Request, error: HTTPException) -> JSONResponse:
+        # Of a path with two routes, FastAPI names the methods of the first alone.
+        fitting = [route for route in app.routes if route.matches(request.scope)[0] is not Match.NONE]
+        methods = sorted({method for route in fitting for method in getattr(route, "methods", ())})
+        return JSONResponse({"detail": error.detail}, 405, {"allow": ", ".join(methods)})
+
 
 def _add_views(app: FastAPI, operation: Operation, refusals: Mapping[int, int]) -> None:
     write = metrics.exposition(operation, refusals)
@@ -126,13 +134,13 @@ def _add_views(app: FastAPI, operation: Operation, refusals: Mapping[int, int]) 
         operation.tick()
         return Response(write(), media_type=metrics.CONTENT_TYPE)
 
-    @app.get("/alarms", response_model=list[AlarmReply])
+    @app.get(ALARMS, response_model=list[AlarmReply])
     async def alarms() -> Any:
         operation.tick()
         return operation.snapshot()["alarms"]
 
     @app.post(
-        "/alarms/{name}/acknowledge",
+        ALARMS + "/{name}/acknowledge",
         response_model=list[AlarmReply],
         responses={404: {"description": "no such alarm"}},
     )

@@ -7,12 +7,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from decision import BatchDecider, Decision, Decisions, Memory, fall_back, memory_of
+from decision import BatchDecider, Decision, Decisions, Memory, memory_of
 from monitor import Monitor
 from server.schema import ModelReply
 
+UNDECIDED = "not decided: "
+"""What the reason begins with where the monitor was not asked, or did not answer in time."""
 HELD = "hold"
-"""How the reasons of held decisions begin."""
+"""How the reasons of held decisions go on."""
 
 
 class OnDuty(NamedTuple):
@@ -34,10 +36,8 @@ class Held:
     """
 
     def __init__(self, monitor: Monitor, why: str) -> None:
-        manifest = monitor.bundle.manifest
-        self._safe = np.clip(np.zeros(2), manifest.action_low, manifest.action_high)
-        self._threshold = monitor.gate.threshold
-        self._reason = f"{HELD}: {why}"
+        self._monitor = monitor
+        self._reason = f"{UNDECIDED}{HELD}: {why}"
 
     def decide(
         self, observation: ArrayLike, hazards: ArrayLike | None = None, memory: Memory | np.void | None = None
@@ -52,7 +52,7 @@ class Held:
         return self._hold(memory_of(len(np.asarray(observation)), memory))
 
     def _hold(self, memory: Memory) -> Decisions:
-        return fall_back(memory, self._reason, self._threshold, self._safe)
+        return self._monitor.fall_back(memory, self._reason)
 
 
 class Duty:

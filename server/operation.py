@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 from monitor import Monitor
@@ -65,6 +65,7 @@ class Operation:
         self.events = events or Events()
         self.states = States(self._moved)
         self.alarms = Alarms(rules, time.monotonic(), self._alarmed)
+        self._unwell: dict[str, None] = {}
         self._marks: deque[_Mark] = deque([self._mark(time.monotonic())])
         self.states.move(Cause.LOADED, f"{monitor.bundle.id} is loaded")
 
@@ -92,6 +93,15 @@ class Operation:
         if states.allows(cause := Cause.TROUBLE if names else Cause.WELL):
             states.move(cause, f"alarm {', '.join(names)}" if names else "no alarm says otherwise")
         return states.state
+
+    def unwell(self, robots: Iterable[str]) -> None:
+        """Sets the alarm `staleness` for these robots, and for no other one."""
+        now = dict.fromkeys(robots)
+        for robot in self._unwell.keys() - now.keys():
+            self.alarms.lower("staleness", robot)
+        for robot in now:
+            self.alarms.raise_("staleness", robot)
+        self._unwell = now
 
     def hold(self, why: str) -> None:
         """From now on every decision is the safe one.

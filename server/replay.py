@@ -22,7 +22,7 @@ from recorder import RecordingError
 from recorder.reading import Reader, Recorded
 from recorder.timeline import Row, Timeline
 from server.desk import Desk
-from server.duty import Duty
+from server.duty import UNDECIDED, Duty
 from server.schema import ModelReply
 
 DIFFERENT = 1
@@ -66,11 +66,13 @@ class Comparison:
     Attributes:
         count: how many.
         differing: how many of them differ.
+        undecided: how many more were the service's own: too late, or too old.
         shown: the first that do: what is to be said of each.
     """
 
     count: int = 0
     differing: int = 0
+    undecided: int = 0
     shown: list[str] = field(default_factory=list)
 
 
@@ -123,6 +125,9 @@ class Again:
             if robot not in wanted:
                 continue
             one, two = (told[place] if place < len(told) else {} for told in (then, now))
+            if (one.get("reason") or "").startswith(UNDECIDED):
+                self.comparison.undecided += 1
+                continue
             self.comparison.count += 1
             if differences := _differences(one, two):
                 self.comparison.differing += 1
@@ -237,6 +242,10 @@ def _told_again(again: Again, console: Console) -> bool:
     found = again.comparison
     if again.other is not None:
         console.print(again.other, style="yellow")
+    if found.undecided:
+        console.print(
+            f"{found.undecided} fallbacks are the service's own (deadline, freshness) and are not compared"
+        )
     if not found.differing:
         console.print(f"{found.count} of {found.count} decisions equal bit for bit", style="green")
         return True

@@ -14,7 +14,7 @@ from math import inf
 from typing import TypeVar
 
 from decision import Decision, Mode, OpenedBy, Origin
-from server.duty import HELD, Duty
+from server.duty import HELD, UNDECIDED, Duty
 from server.observer import Answered
 
 SECONDS = (
@@ -32,8 +32,9 @@ Key = TypeVar("Key")
 _FALLBACK = Mode.FALLBACK
 _KINDS = (
     (f"{HELD}:", HELD),
-    ("deadline", "deadline"),
-    ("stale", "stale"),
+    ("no decision within", "deadline"),
+    ("decisions hang", "deadline"),
+    (UNDECIDED, "stale"),
     ("bad input", "bad input"),
     ("no certified action", "uncertified"),
     ("inside a hazard", "inside a hazard"),

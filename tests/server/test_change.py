@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import http.client
 import json
-import os
 import re
 import shutil
 import signal
@@ -28,7 +27,6 @@ from recorder import RecordingError
 from recorder.reading import Reader
 from server.change import BusyError, Changer
 from server.operation import Operation
-from server.serve import ADMIN_KEY_VARIABLE
 
 COMMAND = [sys.executable, "-m", "server.serve"]
 ADMIN = {"x-api-key": "master", "content-type": "application/json"}
@@ -72,7 +70,7 @@ class Robot(threading.Thread):
         memory = None
         while not self.gone.is_set():
             self._link.request(
-                "POST", "/act", json.dumps({"observation": self._observation, "memory": memory})
+                "POST", "/act", json.dumps({"observation": self._observation, "memory": memory}), ADMIN
             )
             reply = self._link.getresponse()
             self.statuses.add(reply.status)
@@ -112,17 +110,11 @@ def service(folder: Path, tiny_bundle: Path, tmp_path_factory) -> Iterator[tuple
     own = tmp_path_factory.mktemp("own")
     link, tapes = own / "current", own / "tapes"
     link.symlink_to(tiny_bundle)
-    before = os.environ.get(ADMIN_KEY_VARIABLE)
-    os.environ[ADMIN_KEY_VARIABLE] = "master"
-    try:
-        options = ["--port", "0", "--bundles", str(folder), "--record", str(tapes), "--log", "json"]
-        with Service.run([*COMMAND, str(link), *options]) as running:
-            yield running, link, tapes
-    finally:
-        if before is None:
-            del os.environ[ADMIN_KEY_VARIABLE]
-        else:
-            os.environ[ADMIN_KEY_VARIABLE] = before
+    key = own / "key"
+    key.write_text("master")
+    options = ["--port", "0", "--bundles", str(folder), "--record", str(tapes), "--log", "json"]
+    with Service.run([*COMMAND, str(link), *options, "--admin-key-file", str(key)]) as running:
+        yield running, link, tapes
 
 
 def events(service: Service) -> list[dict[str, Any]]:
@@ -152,11 +144,11 @@ def test_bundles_change_while_a_robot_drives_and_nothing_is_lost(
     assert ask(running.url, "POST", "/hold", {"why": "a test"})[0] == 200
     assert ask(running.url, "POST", "/model", {"bundle": "good/second"})[1]["model"] == second
     eventually(lambda: robot.replies[-1]["model"] == second)
-    assert robot.replies[-1]["reason"] == "hold: a test"
+    assert robot.replies[-1]["reason"] == "not decided: hold: a test"
     assert ask(running.url, "POST", "/resume")[1]["state"] == "ready"
     seen = len(robot.replies)
     eventually(lambda: len(robot.replies) > seen + 30)
-    assert robot.replies[-1]["reason"] != "hold: a test"
+    assert robot.replies[-1]["reason"] != "not decided: hold: a test"
     robot.gone.set()
     robot.join(10.0)
     assert robot.statuses == {200}

@@ -17,11 +17,14 @@ from decision import Faults, Mode
 from monitor import Monitor
 from server.alarms import RULES
 from server.app import create_app
+from server.duty import UNDECIDED
+from server.keys import Keys
 from server.metrics import MOST_KINDS
 from server.operation import Operation
 from server.tally import OTHER, REASONS, Histogram, kind_of
 
-ADMIN = {"x-api-key": "master"}
+KEYS = Keys(act="key", admin="master")
+ROBOT, ADMIN = {"x-api-key": "key"}, {"x-api-key": "master"}
 INSIDE = [[0.05, 0.0]]
 """A hazard in which the robot stands."""
 
@@ -37,7 +40,7 @@ def operation(monitor: Monitor) -> Operation:
 @pytest.fixture
 def service(operation: Operation) -> TestClient:
     monitor = operation.duty.now.monitor
-    return TestClient(create_app(monitor, operation=operation, admin_key="master", max_body=20_000))
+    return TestClient(create_app(monitor, operation=operation, keys=KEYS, max_body=20_000), headers=ROBOT)
 
 
 def scrape(service: TestClient) -> dict[tuple[str, ...], float]:
@@ -156,7 +159,7 @@ def test_a_hold_plays_the_plan_then_coasts_until_it_is_lifted(service, observati
     for expected in (*plan, [0.0, 0.0], [0.0, 0.0]):
         told = service.post("/act", json=body).json()
         assert (told["action"], told["mode"]) == (expected, Mode.FALLBACK)
-        assert told["reason"] == "hold: a child is on the floor"
+        assert told["reason"] == UNDECIDED + "hold: a child is on the floor"
         body["memory"] = told["memory"]
     seen = scrape(service)
     assert (seen["state", "hold"], seen["state", "ready"], seen["held",]) == (1.0, 0.0, 1.0)
@@ -172,10 +175,13 @@ def test_a_hold_plays_the_plan_then_coasts_until_it_is_lifted(service, observati
 def test_nobody_resumes_while_an_alarm_holds(monitor, observation) -> None:
     rules = RULES | {"staleness": RULES["staleness"].model_copy(update={"effect": "hold"})}
     operation = Operation(monitor, rules=rules)
-    service = TestClient(create_app(monitor, operation=operation, admin_key="master"))
+    service = TestClient(create_app(monitor, operation=operation, keys=KEYS), headers=ROBOT)
     operation.alarms.raise_("staleness", "robot 7")
     assert service.get("/alarms").status_code == 200
-    assert service.post("/act", json={"observation": observation}).json()["reason"] == "hold: alarm staleness"
+    assert (
+        service.post("/act", json={"observation": observation}).json()["reason"]
+        == UNDECIDED + "hold: alarm staleness"
+    )
     reply = service.post("/resume", headers=ADMIN)
     assert reply.status_code == 409
     assert "staleness" in reply.json()["detail"]
@@ -235,10 +241,10 @@ def test_a_window_forgets(monitor, observation) -> None:
 @pytest.mark.parametrize("path", ["/hold", "/resume", "/model"])
 def test_without_an_admin_key_nobody_is_one(monitor, path: str) -> None:
     for key in (None, "key"):
-        service = TestClient(create_app(monitor, api_key=key))
+        service = TestClient(create_app(monitor, keys=Keys(act=key)))
         for headers in ({"x-api-key": "key"}, {"authorization": "Bearer key"}):
             assert service.post(path, json={}, headers=headers).status_code == 403
-    service = TestClient(create_app(monitor, api_key="key", admin_key="master"))
+    service = TestClient(create_app(monitor, keys=KEYS))
     assert service.post(path, json={}).status_code == 401
     assert service.post(path, json={}, headers={"x-api-key": "key"}).status_code == 403
     assert service.post(path, json={"bundle": "x"}, headers=ADMIN).status_code not in (401, 403, 500)
