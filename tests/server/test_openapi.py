@@ -16,6 +16,7 @@ from server.keys import Keys
 CONFIG = {
     "seed": 1,
     "continue-on-failure": True,
+    "cache": {"enabled": False},
     "generation": {"deterministic": True, "database": "none"},
     # A memory that the schema allows may be one that no reply held: that is 422.
     "checks": {"positive_data_acceptance": {"enabled": False}},
