@@ -9,6 +9,7 @@ from fastapi import FastAPI, HTTPException, Request, Response
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ConfigDict, Field
+from starlette.routing import Match
 
 from server import metrics
 from server.change import BusyError, ChangeError, Changer
@@ -115,6 +116,13 @@ def add_console(
             for item in error.errors()[:_MOST_ERRORS]
         ]
         return JSONResponse({"detail": detail}, 422)
+
+    @app.exception_handler(405)
+    async def not_allowed(request: Request, error: HTTPException) -> JSONResponse:
+        # Of a path with two routes, FastAPI names the methods of the first alone.
+        fitting = [route for route in app.routes if route.matches(request.scope)[0] is not Match.NONE]
+        methods = sorted({method for route in fitting for method in getattr(route, "methods", ())})
+        return JSONResponse({"detail": error.detail}, 405, {"allow": ", ".join(methods)})
 
 
 def _add_views(app: FastAPI, operation: Operation, refusals: Mapping[int, int]) -> None:
