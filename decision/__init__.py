@@ -24,6 +24,7 @@ from decision.memory import (
     next_of_plan,
     remember_sent,
 )
+from decision.parts import in_parts
 from decision.stopwatch import Stopwatch
 
 __all__ = [
@@ -47,6 +48,7 @@ __all__ = [
     "copy_of",
     "fall_back",
     "hazards_of_one",
+    "in_parts",
     "memory_from_json",
     "memory_of",
     "memory_to_json",

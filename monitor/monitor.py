@@ -23,6 +23,7 @@ from decision import (
     Stopwatch,
     fall_back,
     hazards_of_one,
+    in_parts,
     memory_of,
     next_of_plan,
     texts,
@@ -185,7 +186,7 @@ class Monitor:
         given = None if hazards is None else np.asarray(hazards, dtype=np.float64)
         if given is not None and (given.ndim != 3 or given.shape[::2] != (len(rows), 2)):
             raise ValueError(f"hazards must have shape [{len(rows)}, n, 2], got {given.shape}")
-        return self._decide_or_fall_back(rows, given, memory_of(len(rows), memory))
+        return in_parts(self._decide_or_fall_back, rows, given, memory_of(len(rows), memory))
 
     def _decide_or_fall_back(
         self, observation: FloatArray, hazards: FloatArray | None, memory: Memory, lost: str | None = None
