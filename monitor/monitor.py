@@ -360,6 +360,5 @@ def _filter_config(bundle: Bundle, config: FilterConfig) -> FilterConfig:
 def _check_layout(bundle: Bundle) -> None:
     stated = [block.model_dump() for block in bundle.manifest.observation_layout]
     if stated != layout(bundle.manifest.level).to_json():
-        raise MonitorError(
-            f"{bundle.path}: its observation layout is not that of level {bundle.manifest.level} of the task"
-        )
+        level = bundle.manifest.level
+        raise MonitorError(f"{bundle.path}: its observation layout is not that of level {level} of the task")
