@@ -29,9 +29,9 @@ from evaluation.service import Service
 from filter import FilterConfig
 from models import Bundle
 from monitor import Monitor
-from server.app import Lifecycle, Standing
 from server.live import Hub
 from server.observer import Answered
+from server.operation import Operation
 from server.schema import ActRequest
 from server.view import Views
 
@@ -89,7 +89,7 @@ def run(config: LiveBenchmark) -> dict[str, dict[str, FloatArray]]:
 def noted(config: LiveBenchmark, calls: int = 5000, rounds: int = 20) -> float:
     """What the hub adds to a decision while nobody watches [µs]."""
     monitor = Monitor.load(config.bundle, config.gate)
-    hub = Hub(Views(monitor, FilterConfig()), Standing(Lifecycle(), monitor), {})
+    hub = Hub(Views(monitor, FilterConfig()), Operation(monitor), {})
     observation: list[float] = cases(monitor.bundle.manifest.level)["nominal"].asked["observation"]
     asked = ActRequest(observation=observation, robot="ada")
     one: Any = Answered(0, ("h", 1), "/act", b"", 1e-3, 200, b"", [asked], [monitor.decide(observation)])

@@ -25,6 +25,7 @@ from decision.memory import (
     remember_sent,
 )
 from decision.parts import in_parts
+from decision.stopwatch import Stopwatch
 
 __all__ = [
     "HISTORY",
@@ -43,6 +44,7 @@ __all__ = [
     "Mode",
     "OpenedBy",
     "Origin",
+    "Stopwatch",
     "copy_of",
     "fall_back",
     "hazards_of_one",

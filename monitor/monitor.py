@@ -20,6 +20,7 @@ from decision import (
     Mode,
     OpenedBy,
     Origin,
+    Stopwatch,
     fall_back,
     hazards_of_one,
     in_parts,
@@ -72,6 +73,7 @@ class Monitor:
         faults: what went wrong so far.
         robot: the constants of the bundle's robot.
         look: what N robots see, and nothing is decided; see `ActionFilter.look`.
+        stopwatch: how long "inference" and "filter" took.
 
     Raises:
         MonitorError: for an unknown gate, a threshold that is not finite and >= 0 or stands beside a whole
@@ -94,13 +96,13 @@ class Monitor:
         self.robot = _robot(bundle)
         self.guide: Strength = guide
         self.faults = Faults()
+        self.stopwatch = Stopwatch()
         if isinstance(gate, Gate) and threshold is not None:
             raise MonitorError(f"threshold must be None beside a Gate, which has its own, got {threshold}")
         wanted = manifest.threshold if threshold is None else float(threshold)
         self.gate = Gate(gate, wanted, manifest.hysteresis, manifest.dwell) if isinstance(gate, str) else gate
         self._networks = networks
-        self._filter = action_filter
-        self.look = action_filter.look
+        self._filter, self.look = action_filter, action_filter.look
         self._watch = watch
         self._low = np.array(manifest.action_low, np.float64)
         self._high = np.array(manifest.action_high, np.float64)
@@ -153,9 +155,8 @@ class Monitor:
 
         A bad input or any fault inside gives mode "fallback" with the reason.
         """
-        lost = None
         try:
-            past = memory_of(1, memory)
+            past, lost = memory_of(1, memory), None
         except ValueError as error:
             past, lost = np.zeros(1, MEMORY), self._bad(error)
         try:
@@ -197,11 +198,9 @@ class Monitor:
         except Exception as error:  # noqa: BLE001 - whatever it is, the robot needs an action
             if len(observation) <= 1:
                 return self.fall_back(memory, self._note(error))
-        # Something in one row spoils the batch: decide one by one, so that only its own robot gets the
-        # fallback.
+        # Something in one row spoils the batch: one by one, only its own robot gets the fallback.
         rows = [slice(i, i + 1) for i in range(len(observation))]
-        near = [None if hazards is None else hazards[i] for i in rows]
-        alone = zip((observation[i] for i in rows), near, (memory[i] for i in rows), strict=True)
+        alone = [(observation[i], None if hazards is None else hazards[i], memory[i]) for i in rows]
         return Decisions.join([self._decide_or_fall_back(*robot) for robot in alone])
 
     def fall_back(self, memory: Memory, reason: str) -> Decisions:
@@ -220,7 +219,7 @@ class Monitor:
         acts = found.any and self.gate.name != "off"
         if acts:
             scene.doubt(found.doubted)
-        nominal, risk = self._networks.run(observation)
+        nominal, risk = self.stopwatch("inference", self._networks.run, observation)
         if nominal.shape != (len(observation), 2) or risk.shape != nominal.shape[:1]:
             raise NetworkError(f"the networks gave shapes {nominal.shape} and {risk.shape}")
         sound = np.empty(len(risk), np.bool_)
@@ -236,7 +235,7 @@ class Monitor:
             ahead = ~sound & ~scene.doubted
             asked, memory = np.where(sound[:, None], nominal, planned), np.where(ahead, after, memory)
         active = opened_by != ""
-        decided = self._filter.decide(scene, asked, memory, active)
+        decided = self.stopwatch("filter", self._filter.decide, scene, asked, memory, active)
         if decided.action is not asked or decided.mode.shape != active.shape:
             decided.check(asked, active, self._low, self._high)
         if acts:
@@ -307,9 +306,8 @@ class Monitor:
         at_rest = np.zeros((1, blocks.size))
         at_rest[:, blocks.slice("accelerometer")] = (0.0, 0.0, 9.81)
         at_rest[:, blocks.slice("magnetometer")] = (0.0, -0.5, 0.0)
-        decision = self.decide(at_rest[0])
-        if decision.reason is not None:
-            raise MonitorError(f"{self.bundle.path}: cannot decide about a robot at rest: {decision.reason}")
+        if (why := self.decide(at_rest[0]).reason) is not None:
+            raise MonitorError(f"{self.bundle.path}: cannot decide about a robot at rest: {why}")
         asked = np.clip([[1.0, 0.0]], self._low, self._high)
         for speed, distance in product((1.0, 0.5, 0.0), (1.0, 0.7, 0.5, 0.3, 0.24, 0.22, 0.1)):
             at_rest[:, blocks.slice("velocimeter")] = (speed, 0.0, 0.0)
@@ -363,6 +361,5 @@ def _filter_config(bundle: Bundle, config: FilterConfig) -> FilterConfig:
 def _check_layout(bundle: Bundle) -> None:
     stated = [block.model_dump() for block in bundle.manifest.observation_layout]
     if stated != layout(bundle.manifest.level).to_json():
-        raise MonitorError(
-            f"{bundle.path}: its observation layout is not that of level {bundle.manifest.level} of the task"
-        )
+        level = bundle.manifest.level
+        raise MonitorError(f"{bundle.path}: its observation layout is not that of level {level} of the task")

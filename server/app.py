@@ -1,4 +1,4 @@
-"""The HTTP service: `POST /act`, `POST /act/batch`, `/model`, `/healthz`, `/readyz`, and a page at `/`."""
+"""The HTTP service: decisions, what tells of itself, health checks, a page, what operators ask and say."""
 
 from __future__ import annotations
 
@@ -12,22 +12,24 @@ from fastapi.responses import JSONResponse
 from filter import FilterConfig
 from monitor import Monitor
 from recorder import Recorder
+from server.change import Changer
+from server.console import add_console
 from server.desk import Desk
 from server.freshness import Freshness
 from server.guard import Guard
 from server.keys import ACT, BATCH, Keys
-from server.live import Hub, Operation
+from server.live import Hub
 from server.observer import Observer, Recording
+from server.operation import Operation
 from server.robots import RESET, robots_router
 from server.safety import Safety
 from server.schema import MAX_ROBOTS, ActReply, ActRequest, BatchReply, ModelReply
+from server.states import NOT_READY, State
 from server.static import routes
 from server.view import Views
 
 MAX_BODY = 65536
 """Most bytes of a request's body: 60 numbers and a thousand hazards fit."""
-MANY_FAULTS = 5
-"""Internal faults within a minute from which on the service is not ready: a robot may live with one."""
 BATCH_BODY = 16
 """The body of a batch may be so many times as large."""
 
@@ -59,36 +61,17 @@ class Lifecycle:
     at_end: list[Callable[[], None]] = field(default_factory=list)
 
 
-@dataclass(frozen=True)
-class Standing:
-    """An `Operation` that knows no alarms.
-
-    Attributes:
-        lifecycle: whether it drains.
-        monitor: whether it has faults.
-    """
-
-    lifecycle: Lifecycle
-    monitor: Monitor
-
-    def snapshot(self) -> dict[str, Any]:
-        """What the page shows."""
-        degraded = self.monitor.faults.internal() >= MANY_FAULTS
-        state = "draining" if self.lifecycle.draining else "degraded" if degraded else "ready"
-        counters = dict(self.monitor.faults.counts)
-        return {"state": state, "alarms": [], "counters": counters, "model": self.monitor.bundle.id}
-
-
 def create_app(
     monitor: Monitor,
     lifecycle: Lifecycle | None = None,
     keys: Keys | None = None,
     max_body: int = MAX_BODY,
     recorder: Recorder | None = None,
+    operation: Operation | None = None,
+    changer: Changer | None = None,
     safety: Safety | None = None,
     freshness: Freshness | None = None,
     filter_config: FilterConfig | None = None,
-    operation: Operation | None = None,
 ) -> Guard:
     """The service around one monitor that is loaded and warmed up.
 
@@ -98,15 +81,18 @@ def create_app(
         keys: those that every request but the health checks must carry one of; None asks for none.
         max_body: most bytes of a request's body; a batch's may be `BATCH_BODY` times as large.
         recorder: what records the decisions, if any does.
+        operation: what an operator sees and says; by default one with the usual alarms.
+        changer: changes the bundle; None: nobody does.
         safety: the limits within which it decides.
         freshness: shared with whoever looks for silent robots; by default one within `safety.freshness`.
         filter_config: the filter's settings; None: the defaults.
-        operation: tells the page where the service stands; None: the life cycle and the faults alone.
     """
     state = lifecycle or Lifecycle()
     limits = safety or Safety()
     known = freshness or Freshness(limits.freshness, monitor.faults.note)
-    model = ModelReply.of(monitor)
+    watched = operation or Operation(monitor, recorder)
+    duty = watched.duty
+    model = duty.now.model
     # No /docs: its page loads scripts from other hosts. /openapi.json is there.
     app = FastAPI(
         title="Lagnet", description="What a watched robot policy does next.", docs_url=None, redoc_url=None
@@ -131,32 +117,35 @@ def create_app(
 
     @app.get("/model", response_model=ModelReply)
     async def about() -> ModelReply:
-        return model
+        return duty.now.model
 
     @app.get("/healthz")
     async def healthz() -> dict[str, Any]:
         # A service that can no longer record is alive, and says so.
-        return {"status": "alive"} | ({} if recorder is None else {"recording": recorder.status()})
+        told = {"status": "alive", "state": watched.states.state}
+        return told | ({} if recorder is None else {"recording": recorder.status()})
 
-    @app.get("/readyz", responses={503: {"description": "draining, or degraded by its own faults"}})
+    @app.get("/readyz", responses={503: {"description": "starting, degraded, draining or stopped"}})
     async def readyz() -> JSONResponse:
         if state.draining:
-            return JSONResponse({"status": "draining"}, status_code=503)
-        faults = monitor.faults.internal()
-        if faults >= MANY_FAULTS:
-            return JSONResponse({"status": "degraded", "internal_faults": faults}, status_code=503)
-        return JSONResponse({"status": "ready"})
+            watched.drain()
+        status = watched.tick()
+        told = {"why": watched.states.why} if status in (State.DEGRADED, State.HOLD) else {}
+        return JSONResponse({"status": status} | told, 503 if status in NOT_READY else 200)
 
-    views = Views(monitor, filter_config or FilterConfig())
     facts = model.model_dump(include={"model", "task", "gate", "threshold", "guide"})
     facts["full_thrust"] = monitor.robot.force_limit
-    hub = Hub(views, operation or Standing(state, monitor), facts)
+    hub = Hub(Views(monitor, filter_config or FilterConfig()), watched, facts)
     state.at_end.append(hub.close)
     app.router.routes.extend(routes(hub))
+    observers: list[Observer] = [watched.tally, hub]
+    if recorder is not None:
+        observers.append(Recording(recorder, model))
     app.include_router(robots_router(known, _REFUSALS))
-    observers: list[Observer] = [hub] if recorder is None else [hub, Recording(recorder)]
-    desk = Desk(app, monitor, model, observers, limits, known)
-    return Guard(desk, keys or Keys(), max_body, {BATCH: BATCH_BODY * max_body})
+    desk = Desk(app, duty, observers, limits, known)
+    guard = Guard(desk, keys or Keys(), max_body, {BATCH: BATCH_BODY * max_body})
+    add_console(app, watched, changer, guard.refusals)
+    return guard
 
 
 def _act_schema(model: ModelReply) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -17,7 +18,7 @@ from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from decision import MEMORY, Decision, Memory, copy_of, memory_from_json
-from monitor import Monitor
+from server.duty import UNDECIDED, Duty, OnDuty
 from server.freshness import Freshness, Unfit
 from server.guard import AT_ONCE, RETRY_AFTER, BodyTooLargeError
 from server.hands import Hands, LateError
@@ -28,9 +29,6 @@ from server.safety import Safety
 from server.schema import ActRequest, BatchReply, BatchRequest, ModelReply, Refusal, Reply, reply_of
 
 FloatArray = NDArray[np.float64]
-
-UNDECIDED = "not decided: "
-"""What the reason begins with where the monitor was not asked, or did not answer in time."""
 
 _MAX_ERRORS = 8
 _QUICK = 0.005
@@ -48,8 +46,14 @@ class Answer(NamedTuple):
     """The requests that were decided about, in order."""
     decisions: Sequence[Decision] = ()
     """What was decided about each."""
+    model: ModelReply | None = None
+    """What the one who decided tells of itself."""
+    begun: float = math.nan
+    """When that began, on the clock of `time.perf_counter` [s]."""
 
 
+Decided = tuple[BaseModel, list[ActRequest], list[Decision]]
+"""The reply, who was decided about, and what was decided."""
 Problem = tuple[list[str | int], str, str]
 """Where in the body, what is wrong, and its kind."""
 Validated = TypeVar("Validated", bound=BaseModel)
@@ -77,8 +81,7 @@ class Desk:
 
     Args:
         app: what answers the other paths.
-        monitor: what decides.
-        model: what it told of itself.
+        duty: who decides.
         observers: told of every answer, in order.
         safety: how long a decision may take, and how many may wait for theirs.
         freshness: what knows the robots; None: whatever comes is fresh.
@@ -87,16 +90,14 @@ class Desk:
     def __init__(
         self,
         app: ASGIApp,
-        monitor: Monitor,
-        model: ModelReply,
+        duty: Duty,
         observers: Sequence[Observer] = (),
         safety: Safety | None = None,
         freshness: Freshness | None = None,
     ) -> None:
         limits = safety or Safety()
         self._app = app
-        self._monitor = monitor
-        self._model = model
+        self._duty = duty
         self._observers = observers
         self._freshness = freshness
         self._hands = Hands(limits.deadline)
@@ -112,20 +113,22 @@ class Desk:
             return
         started = time.perf_counter()
         content = b""
-        received = time.time_ns()
+        received, ready = time.time_ns(), started
         try:
             content = await _body(receive)
-            received = time.time_ns()
+            received, ready = time.time_ns(), time.perf_counter()
             answer = await self.decided(scope["path"], content, started, scope.get("client"))
         except BodyTooLargeError as error:
             answer = _problem(413, [([], str(error), "too_large")])
-        if self._observers:
-            seconds = time.perf_counter() - started
-            client = scope.get("client")
-            answered = Answered(received, client, scope["path"], content, seconds, *answer)
+        seconds = time.perf_counter() - started
+        try:
+            await _reply(scope, send, answer.status, answer.body)
+        finally:
+            # Once the reply is on its way: a robot waits for nobody who looks on.
+            client, queued = scope.get("client"), answer.begun - ready
+            answered = Answered(received, client, scope["path"], content, seconds, *answer[:-1], queued)
             for observer in self._observers:
                 observer.answered(answered)
-        await _reply(scope, send, answer.status, answer.body)
 
     def answer(self, content: bytes, batch: bool) -> Answer:
         """The answer to the body of a `POST /act`, or of a `POST /act/batch`."""
@@ -152,44 +155,45 @@ class Desk:
         except FullError as full:
             return _problem(503, [([], str(full), "overloaded")])
         except LateError as late:
-            self._monitor.faults.note("deadline", str(late))
+            self._duty.now.monitor.faults.note("deadline", str(late))
             return answers(content, started, arrived, str(late))
 
     def _one(self, content: bytes, started: float, arrived: float, lost: str | None = None) -> Answer:
         """Answers the body of `POST /act`; with the fallback, if what else could have been is lost."""
         begun = time.perf_counter()
-        answer = self._guarded(lambda: self._decide(content, started, arrived, lost))
+        answer = self._guarded(lambda now: self._decide(now, content, started, arrived, lost))
         self._quick = self._quick + 1 if time.perf_counter() - begun < _QUICK else 0
         return answer
 
     def _batch(self, content: bytes, started: float, arrived: float, lost: str | None = None) -> Answer:
         """Answers the body of `POST /act/batch`."""
-        return self._guarded(lambda: self._decide_batch(content, started, arrived, lost))
+        return self._guarded(lambda now: self._decide_batch(now, content, started, arrived, lost))
 
-    def _guarded(self, decide: Callable[[], tuple[BaseModel, list[ActRequest], list[Decision]]]) -> Answer:
+    def _guarded(self, decide: Callable[[OnDuty], Decided]) -> Answer:
+        begun, now = time.perf_counter(), self._duty.now
         try:
-            reply, asked, decisions = decide()
-            return Answer(200, reply.model_dump_json().encode(), asked, decisions)
+            reply, asked, decisions = decide(now)
+            return Answer(200, reply.model_dump_json().encode(), asked, decisions, now.model, begun)
         except RefusedError as error:
             return _problem(422, error.errors)
         except Exception as error:  # noqa: BLE001 - counted and logged; the client has a fallback of its own
-            self._monitor.faults.note(type(error).__name__, "the decision could not be told", error)
+            now.monitor.faults.note(type(error).__name__, "the decision could not be told", error)
             return _problem(500, [([], "internal error", "internal")])
 
     def _decide(
-        self, content: bytes, started: float, arrived: float, lost: str | None
-    ) -> tuple[BaseModel, list[ActRequest], list[Decision]]:
+        self, now: OnDuty, content: bytes, started: float, arrived: float, lost: str | None
+    ) -> Decided:
         asked, memory = self._read(lambda: ActRequest.model_validate_json(content))
         unfit = self._unfit(asked, arrived, lost)
         if unfit is None:
-            decision = self._monitor.decide(asked.observation, asked.hazards, memory)
+            decision = now.decider.decide(asked.observation, asked.hazards, memory)
         else:
-            decision = self._fall_back(memory, unfit)
-        return self._told(decision, asked, started), [asked], [decision]
+            decision = self._fall_back(now, memory, unfit)
+        return self._told(now, decision, asked, started), [asked], [decision]
 
     def _decide_batch(
-        self, content: bytes, started: float, arrived: float, lost: str | None
-    ) -> tuple[BaseModel, list[ActRequest], list[Decision]]:
+        self, now: OnDuty, content: bytes, started: float, arrived: float, lost: str | None
+    ) -> Decided:
         """One call of the monitor for all robots whose requests are in order; the others are told why not."""
         replies: list[Reply | Refusal] = []
         rows: list[tuple[int, ActRequest, Memory | None]] = []
@@ -202,11 +206,11 @@ class Desk:
                 if (unfit := self._unfit(asked, arrived, lost)) is None:
                     rows.append((place, asked, memory))
                 else:
-                    told[place] = asked, self._fall_back(memory, unfit)
+                    told[place] = asked, self._fall_back(now, memory, unfit)
             except RefusedError as error:
                 replies.append(Refusal(detail=_detail(error.errors)))
         if rows:
-            decisions = self._monitor.decide_batch(
+            decisions = now.decider.decide_batch(
                 np.array([asked.observation for _, asked, _ in rows]),
                 _hazards([asked.hazards or [] for _, asked, _ in rows]),
                 np.concatenate([np.zeros(1, MEMORY) if memory is None else memory for _, _, memory in rows]),
@@ -216,7 +220,7 @@ class Desk:
                 told[place] = asked, _of_its_own(decisions[row], len(asked.hazards or []), most)
         in_order = [told[place] for place in sorted(told)]
         for place, (asked, decision) in told.items():
-            replies[place] = self._told(decision, asked, started)
+            replies[place] = self._told(now, decision, asked, started)
         decided = [decision for _, decision in in_order]
         return BatchReply(replies=replies), [asked for asked, _ in in_order], decided
 
@@ -227,7 +231,7 @@ class Desk:
             RefusedError: if it cannot be decided about.
         """
         asked = _validated(validate)
-        size = self._model.observation_size
+        size = self._duty.now.model.observation_size
         if len(asked.observation) != size:
             message = f"must have {size} numbers, got {len(asked.observation)}"
             raise RefusedError([(["observation"], message, "wrong_length")])
@@ -245,16 +249,18 @@ class Desk:
         self._freshness.missed(asked.robot)
         return Unfit("deadline", lost)
 
-    def _fall_back(self, memory: Memory | None, unfit: Unfit) -> Decision:
+    @staticmethod
+    def _fall_back(now: OnDuty, memory: Memory | None, unfit: Unfit) -> Decision:
         """The plan goes on, unless it is over; then the safe action."""
         past = np.zeros(1, MEMORY) if memory is None else copy_of(memory)
         if unfit.over:
             past["left"] = 0
-        return self._monitor.fall_back(past, UNDECIDED + unfit.reason)[0]
+        return now.monitor.fall_back(past, UNDECIDED + unfit.reason)[0]
 
-    def _told(self, decision: Decision, asked: ActRequest, started: float) -> Reply:
+    @staticmethod
+    def _told(now: OnDuty, decision: Decision, asked: ActRequest, started: float) -> Reply:
         seconds = time.perf_counter() - started
-        return reply_of(decision, asked.request, self._model.model, self._model.gate, seconds)
+        return reply_of(decision, asked.request, now.model.model, now.model.gate, seconds)
 
 
 def _validated(validate: Callable[[], Validated]) -> Validated:

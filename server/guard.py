@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Mapping
 from contextlib import suppress
 from typing import Any
@@ -10,8 +11,10 @@ from typing import Any
 from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from server.keys import ACT, BATCH, Keys, Level, needed
+from server.keys import ACT, BATCH, HOLD, MODEL, RESUME, Keys, Level, needed
 
+ADMIN_PATHS = frozenset({MODEL, HOLD, RESUME})
+"""Whoever posts there needs the admin key. Where there is none it is refused: any page in a browser could."""
 AT_ONCE = "lagnet.at_once"
 """The ASGI extension by which the server takes status and body of a JSON reply at once: True if it did."""
 FULL = "lagnet.full"
@@ -34,11 +37,15 @@ class Guard:
         keys: those that `Authorization: Bearer KEY` or `X-API-Key: KEY` may carry.
         max_body: most bytes of a request's body.
         larger: path → most bytes of a body there, where that is more.
+
+    Attributes:
+        refusals: status → requests refused here.
     """
 
     def __init__(
         self, app: ASGIApp, keys: Keys, max_body: int, larger: Mapping[str, int] | None = None
     ) -> None:
+        self.refusals: Counter[int] = Counter()
         self._app = app
         self._keys = keys
         self._max_body = max_body
@@ -53,16 +60,19 @@ class Guard:
         wanted = needed(scope)
         if wanted and (granted := self._keys.granted(headers)) < wanted:
             status, message = _not_allowed(granted, wanted)
-            await _refuse(send, status, "header", "authorization", message)
+            await self._refuse(send, status, "header", "authorization", message)
+            return
+        if scope["path"] in ADMIN_PATHS and scope["method"] == "POST" and self._keys.admin is None:
+            await self._refuse(send, 403, "header", "authorization", "the service has no admin key")
             return
         if scope["path"] in (ACT, BATCH) and scope.get("extensions", {}).get(FULL):
-            await _refuse(send, 503, "connection", "limit", "every connection awaits its answer")
+            await self._refuse(send, 503, "connection", "limit", "every connection awaits its answer")
             return
         max_body = self._larger.get(scope["path"], self._max_body)
         stated = headers.get(b"content-length", b"")
         # int() refuses thousands of digits.
         if stated.isdigit() and (len(stated) > _MAX_DIGITS or int(stated) > max_body):
-            await _refuse(send, 413, "body", "content-length", _too_large(max_body))
+            await self._refuse(send, 413, "body", "content-length", _too_large(max_body))
             return
         if not stated.isdigit() or b"transfer-encoding" in headers:
             receive = _limited(receive, max_body)
@@ -73,6 +83,10 @@ class Guard:
     def is_robots(self, scope: Mapping[str, Any]) -> bool:
         """Whether a request is one that only a robot makes: for a decision, with the key."""
         return scope["path"] in (ACT, BATCH) and self._keys.granted(dict(scope["headers"])) >= Level.ACT
+
+    async def _refuse(self, send: Send, status: int, place: str, name: str, message: str) -> None:
+        self.refusals[status] += 1
+        await _refuse(send, status, place, name, message)
 
 
 def _not_allowed(granted: Level, wanted: Level) -> tuple[int, str]:

@@ -10,8 +10,7 @@ from functools import cached_property
 from typing import Any
 
 ACT, BATCH = "/act", "/act/batch"
-ALARM = "/alarms/"
-"""What the path of an alarm begins with, at which it is acknowledged."""
+MODEL, HOLD, RESUME, ALARMS = "/model", "/hold", "/resume", "/alarms"
 HOME, PAGE = "/", "/page/"
 """The live page, and what its files' paths begin with: they hold no secret."""
 OPEN_PATHS = frozenset({"/healthz", "/readyz", HOME})
@@ -34,8 +33,10 @@ class Level(IntEnum):
 def needed(scope: Mapping[str, Any]) -> Level:
     """What a request takes, by its ASGI scope."""
     path = scope["path"]
-    if path == ACT or path.startswith((f"{ACT}/", ALARM)):
+    if path == ACT or path.startswith(f"{ACT}/"):
         return Level.ACT
+    if path.startswith(f"{ALARMS}/"):
+        return Level.ACT  # whoever drives robots says that an alarm was seen
     if path in OPEN_PATHS or path.startswith(PAGE):
         return Level.NOTHING
     return Level.READ if scope.get("method", "GET") in ("GET", "HEAD") else Level.ADMIN

@@ -194,7 +194,6 @@ class Hub:
 
     Attributes:
         faults: what went wrong here so far.
-        views: as given; to be replaced when another bundle decides.
     """
 
     def __init__(
@@ -206,7 +205,7 @@ class Hub:
         patience: float = PATIENCE,
     ) -> None:
         self.faults = Faults("lagnet.live")
-        self.views = views
+        self._views = views
         self._operation = operation
         self._about = json.dumps(dict(about), allow_nan=False)
         self._clock = clock
@@ -309,7 +308,7 @@ class Hub:
     def _look(self, named: dict[str, Robot], wanted: str | None) -> str:
         """What the robot sees that is looked at, as JSON."""
         text = wanted if wanted in named else next(iter(named), None)
-        view = None if text is None else self.views.of(named[text].asked, named[text].decision)
+        view = None if text is None else self._views.of(named[text].asked, named[text].decision)
         return f'"looked": {json.dumps(text)}, "view": {json.dumps(view, allow_nan=False)}'
 
     def _makes_room(self, now: float) -> bool:

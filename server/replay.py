@@ -21,7 +21,8 @@ from monitor import Monitor, MonitorError
 from recorder import RecordingError
 from recorder.reading import Reader, Recorded
 from recorder.timeline import Row, Timeline
-from server.desk import UNDECIDED, Desk
+from server.desk import Desk
+from server.duty import UNDECIDED, Duty
 from server.schema import ModelReply
 
 DIFFERENT = 1
@@ -101,7 +102,7 @@ class Again:
             raise RecordingError(f"the recording is of another version of lagnet-serve: {error}") from error
         monitor = Monitor.load(bundle, gate, threshold, filter_config, guide)
         now = ModelReply.of(monitor)
-        self._desk = Desk(_nobody, monitor, now)
+        self._desk = Desk(_nobody, Duty(monitor, now))
         self.comparison = Comparison()
         self.other = None
         if now.sha256 != files:

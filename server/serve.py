@@ -8,11 +8,12 @@ import ipaddress
 import json
 import math
 import os
+import signal
 import socket
 import ssl
 import sys
 import time
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -27,11 +28,15 @@ from filter import FilterConfig
 from models import BundleError
 from monitor import DEFAULT_STRENGTH, GateName, Monitor, MonitorError, Strength
 from recorder import Recorder, RecordingError, Settings
+from server.alarms import AlarmsError, read_rules
 from server.app import MAX_BODY, Lifecycle, create_app
+from server.change import ChangeError, Changer
 from server.door import Connection, Door, Patience
+from server.events import Events, Form
 from server.freshness import Freshness, Limits
 from server.guard import Guard
 from server.keys import Keys
+from server.operation import Operation
 from server.safety import Safety
 from server.schema import ModelReply
 
@@ -128,6 +133,13 @@ class ServeConfig:
     """Folder for the last 30 s before every fallback or alarm; by default that of --record."""
     incidents_mb: float = 256.0
     """Size of all files of incidents in it [MB]; where they come to more, the oldest go."""
+    alarms: Path | None = None
+    """TOML file with settings of alarms that are to be other than usual."""
+    log: Form = "text"
+    """How events are told on standard error: warnings and errors as text, or all of them as JSON, a line
+    each."""
+    bundles: Path | None = None
+    """Folder with other bundles, which POST /model may change to. SIGHUP loads the service's own anew."""
 
     def filter_config(self) -> FilterConfig:
         """The filter's settings, or ServeError for one that is out of its range."""
@@ -153,6 +165,8 @@ class ServeConfig:
         self.safety()
         self._check_tls()
         self._check_recording()
+        if self.bundles is not None and not self.bundles.is_dir():
+            raise ServeError(f"--bundles {self.bundles}: no such folder")
 
     def safety(self) -> Safety:
         """The limits within which it decides, or ServeError for one that is none."""
@@ -234,6 +248,8 @@ class DrainingServer(uvicorn.Server):
         announcement: a line for stdout, written once it listens and stops in order when told to.
         door: who may stay connected.
         freshness: which robots it knows.
+        operation: looked at ten times a second.
+        changer: loads the bundle anew on SIGHUP.
     """
 
     def __init__(
@@ -244,8 +260,13 @@ class DrainingServer(uvicorn.Server):
         announcement: str,
         door: Door,
         freshness: Freshness | None = None,
+        operation: Operation | None = None,
+        changer: Changer | None = None,
     ) -> None:
         super().__init__(config)
+        self._operation = operation
+        self._changer = changer
+        self._change: asyncio.Task[None] | None = None
         self.server_state = self._door = door
         self._freshness = freshness
         self._lifecycle = lifecycle
@@ -271,6 +292,8 @@ class DrainingServer(uvicorn.Server):
             )
             for listener in sockets or []
         ]
+        if self._changer is not None and hasattr(signal, "SIGHUP"):
+            asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, self._on_hangup, self._changer)
         sys.stdout.write(self._announcement + "\n")
         sys.stdout.flush()
 
@@ -292,9 +315,23 @@ class DrainingServer(uvicorn.Server):
         self._door.sweep(asyncio.get_running_loop().time())
         if self._freshness is not None:
             self._freshness.sweep(time.perf_counter())
+        if self._operation is not None:
+            # Not in the signal's handler: it may come in the middle of anything.
+            if self._lifecycle.draining:
+                self._operation.drain()
+            if self._freshness is not None:
+                self._operation.unwell(self._freshness.unwell(time.perf_counter()))
+            self._operation.tick()
         if self._stop_at is not None and time.monotonic() >= self._stop_at:
             self.should_exit = True
         return await super().on_tick(counter)
+
+    def _on_hangup(self, changer: Changer) -> None:
+        async def again() -> None:
+            with suppress(ChangeError):  # it was told
+                await changer.again()
+
+        self._change = asyncio.get_running_loop().create_task(again())
 
 
 def listen(host: str, port: int, keys: Keys) -> socket.socket:
@@ -388,18 +425,22 @@ def serve(config: ServeConfig) -> None:
 
     Raises:
         ServeError: for settings or an address that cannot be had.
+        AlarmsError: for settings of alarms that cannot be used.
         BundleError: if the bundle must not be used.
         MonitorError: if it cannot be run with these settings.
         RecordingError: if it cannot be recorded.
     """
     config.check()
     keys = read_keys(config)
+    rules = read_rules(config.alarms)
     allow_files(config.max_connections)
     listener = listen(config.host, config.port, keys)
     with listener:
-        monitor = Monitor.load(
-            config.bundle, config.gate, config.threshold, config.filter_config(), config.guide
-        )
+
+        def load(bundle: Path) -> Monitor:
+            return Monitor.load(bundle, config.gate, config.threshold, config.filter_config(), config.guide)
+
+        monitor = load(config.bundle)
         lifecycle = Lifecycle()
         host, port = listener.getsockname()[:2]
         scheme = "http" if config.tls_cert is None else "https"
@@ -407,15 +448,19 @@ def serve(config: ServeConfig) -> None:
         ready = {"event": "listening", "url": url, "host": host, "port": port, "model": monitor.bundle.id}
         gate = {"gate": monitor.gate.name, "threshold": monitor.gate.threshold, "guide": config.guide}
         announcement = json.dumps(ready | gate)
-        with recorder_of(config, monitor) as recorder:
+        with Events(config.log) as events, recorder_of(config, monitor) as recorder:
             safety = config.safety()
             freshness = Freshness(safety.freshness, monitor.faults.note)
+            operation = Operation(monitor, recorder, rules, events)
+            changer = Changer(operation, load, config.bundle, config.bundles)
             app = create_app(
                 monitor,
                 lifecycle,
                 keys,
                 config.max_body,
                 recorder,
+                operation,
+                changer,
                 safety,
                 freshness,
                 config.filter_config(),
@@ -423,7 +468,10 @@ def serve(config: ServeConfig) -> None:
             # What is loaded stays: looking through it again and again for garbage would hold up decisions.
             gc.collect()
             gc.freeze()
-            _server(app, lifecycle, config, announcement, freshness).run(sockets=[listener])
+            _server(app, lifecycle, config, announcement, freshness, operation, changer).run(
+                sockets=[listener]
+            )
+            operation.stop()
 
 
 def recorder_of(config: ServeConfig, monitor: Monitor) -> AbstractContextManager[Recorder | None]:
@@ -439,11 +487,18 @@ def recorder_of(config: ServeConfig, monitor: Monitor) -> AbstractContextManager
 
 
 def _server(
-    app: Guard, lifecycle: Lifecycle, config: ServeConfig, announcement: str, freshness: Freshness
+    app: Guard,
+    lifecycle: Lifecycle,
+    config: ServeConfig,
+    announcement: str,
+    freshness: Freshness,
+    operation: Operation,
+    changer: Changer,
 ) -> DrainingServer:
     settings = uvicorn.Config(
         app,
         access_log=False,
+        log_config=None,  # `Events` tells what it logs
         log_level="error",  # warnings are of what anybody may send, a line each
         lifespan="off",
         ws="none",
@@ -456,12 +511,14 @@ def _server(
     )
     patience = Patience(config.read_seconds, config.idle_seconds, config.max_connections)
     door = Door(patience, app.is_robots)
-    return DrainingServer(settings, lifecycle, config.drain_seconds, announcement, door, freshness)
+    return DrainingServer(
+        settings, lifecycle, config.drain_seconds, announcement, door, freshness, operation, changer
+    )
 
 
 def main() -> None:
     """Entry point of `lagnet-serve`: exit status 0 after an orderly stop, 2 if it could not start."""
-    with command("lagnet-serve", ServeError, BundleError, MonitorError, RecordingError):
+    with command("lagnet-serve", ServeError, AlarmsError, BundleError, MonitorError, RecordingError):
         serve(settings(ServeConfig, "lagnet-serve"))
 
 

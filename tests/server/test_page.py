@@ -26,6 +26,7 @@ from monitor import Monitor
 from pointgoal.vector import PointGoalVectorEnv
 from server.app import Lifecycle, create_app
 from server.keys import Keys
+from server.operation import Operation
 
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 pytestmark = pytest.mark.skipif(BROWSER is None, reason="no Chromium here: apt-get install chromium")
@@ -69,10 +70,10 @@ def opened(browser: Any) -> Iterator[Any]:
     assert complaints == []
 
 
-class Operation:
+class ByHand(Operation):
     """Alarms by hand, and their acknowledgement with a key of its own."""
 
-    def __init__(self) -> None:
+    def begin(self) -> None:
         self.state = "ready"
         self.alarms: list[dict[str, Any]] = []
         self.key: str | None = None
@@ -85,7 +86,7 @@ class Operation:
         self.alarms.append(alarm | {"acknowledged": False, "cause": "made by hand"})
         return self.alarms[-1]
 
-    def acknowledge(self, path: str, headers: dict[bytes, bytes]) -> int:
+    def seen(self, path: str, headers: dict[bytes, bytes]) -> int:
         if self.key is not None and headers.get(b"authorization") != f"Bearer {self.key}".encode():
             return 403
         for alarm in self.alarms:
@@ -99,13 +100,14 @@ class Running:
     """A service in this process, whose operation a test has in hand."""
 
     def __init__(self, monitor: Monitor, keys: Keys | None = None) -> None:
-        self.operation = Operation()
+        self.operation = ByHand(monitor)
+        self.operation.begin()
         self._lifecycle = Lifecycle()
         app = create_app(monitor, self._lifecycle, keys, operation=self.operation)
 
         async def answers(scope: Scope, receive: Receive, send: Send) -> None:
             if scope["type"] == "http" and scope["path"].startswith("/alarms/"):
-                status = self.operation.acknowledge(scope["path"], dict(scope["headers"]))
+                status = self.operation.seen(scope["path"], dict(scope["headers"]))
                 await JSONResponse({}, status)(scope, receive, send)
             else:
                 await app(scope, receive, send)
@@ -141,7 +143,7 @@ def running(monitor: Monitor) -> Iterator[Running]:
 
 @pytest.fixture
 def service(running: Running) -> Running:
-    running.operation.__init__()
+    running.operation.begin()
     return running
 
 
