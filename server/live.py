@@ -227,11 +227,17 @@ class Hub:
         return len(self._watchers)
 
     def answered(self, answered: Answered) -> None:
-        """Takes note of the decisions of one request."""
+        """Takes note of the decisions of one request; whatever fails here costs no robot its answer."""
+        try:
+            self._note(answered)
+        except Exception as error:  # noqa: BLE001 - the page may go, the service may not
+            self.faults.note(type(error).__name__, "a decision is not on the page", error)
+
+    def _note(self, answered: Answered) -> None:
         now = self._clock()
         robots, seconds = self._robots, answered.seconds
         for place, (asked, decision) in enumerate(zip(answered.asked, answered.decisions, strict=False)):
-            name = asked.robot or (answered.client, place)
+            name = asked.robot or (tuple(answered.client or ()), place)
             robot = robots.get(name)
             if robot is not None:
                 robot.note(asked, decision, seconds, now)

@@ -200,6 +200,14 @@ def test_a_fault_of_the_page_ends_its_streams_alone(views, decision) -> None:
     asyncio.run(watch())
 
 
+def test_what_the_hub_cannot_take_note_of_costs_no_robot_its_answer(views, decision) -> None:
+    hub = Hub(views, Standing(), {})
+    hub.answered(answered(asks(), decision, client=["a server may give a list", 1]))
+    assert not hub.faults.counts
+    hub.answered(answered(asks(), None))
+    assert hub.faults.counts["AttributeError"] == 1
+
+
 def test_the_view_is_what_the_filter_sees(hand, monitor: Monitor, views: Views) -> None:
     """Against the tests' own dynamics: the path is that of the action and of the plan."""
     places = np.array([[0.32, 0.05], [-0.9, 0.4]])
