@@ -89,8 +89,8 @@ def gap_segment(
     least = min(start, end)
     if 0.5 * (start + end - length) >= min(least, bound):
         return least
-    # A cone is convex, and along the segment its distance bends smoothly but where the axis is crossed; beside
-    # the straight sides it is linear: so it is least at an end, there, or where a centre is nearest.
+    # A cone is convex, and its distance along the segment smooth but where that crosses the axis; beside the
+    # straight sides it is linear. So it is least at an end, there, or where a centre is nearest.
     if 0.0 < at < 1.0:
         least = min(least, gap(obstacles, i, x0 + at * dx, y0 + at * dy))
     at += (obstacles[i, 2] * dx + obstacles[i, 3] * dy) / square
