@@ -18,11 +18,11 @@ from decision.memory import (
     SENSED,
     Memory,
     copy_of,
-    memory_from_json,
     memory_of,
-    memory_to_json,
     next_of_plan,
+    pack,
     remember_sent,
+    unpack,
 )
 
 __all__ = [
@@ -45,11 +45,11 @@ __all__ = [
     "copy_of",
     "fall_back",
     "hazards_of_one",
-    "memory_from_json",
     "memory_of",
-    "memory_to_json",
     "next_of_plan",
+    "pack",
     "remember_sent",
     "texts",
     "unknown",
+    "unpack",
 ]

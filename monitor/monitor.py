@@ -138,7 +138,11 @@ class Monitor:
         return Monitor(bundle, networks, action_filter, gate, threshold, guide, watch)
 
     def decide(
-        self, observation: ArrayLike, hazards: ArrayLike | None = None, memory: Memory | np.void | None = None
+        self,
+        observation: ArrayLike,
+        hazards: ArrayLike | None = None,
+        memory: Memory | np.void | None = None,
+        lost: str | None = None,
     ) -> Decision:
         """Decides for one robot.
 
@@ -147,10 +151,11 @@ class Monitor:
             hazards: (n, 2), centres of hazards in the body frame [m], x ahead, y left; None or none at all:
                 what the lidar shows. Hazards that the lidar shows beside the given ones count as well.
             memory: the `memory` of this robot's last decision; None before its first.
+            lost: why this is not what the robot's last decision left, or None: with it nothing nominal is
+                sent, and the mode is "fallback".
 
         A bad input or any fault inside gives mode "fallback" with the reason.
         """
-        lost = None
         try:
             past = memory_of(1, memory)
         except ValueError as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import secrets
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +13,7 @@ from monitor import Monitor
 from recorder import Recorder
 from server.desk import Desk
 from server.guard import ACT, BATCH, Guard
+from server.keeper import KEY_BYTES, Keeper
 from server.observer import Observer, Recording
 from server.schema import MAX_ROBOTS, ActReply, ActRequest, BatchReply, ModelReply
 
@@ -46,6 +48,7 @@ def create_app(
     api_key: str | None = None,
     max_body: int = MAX_BODY,
     recorder: Recorder | None = None,
+    memory_key: bytes | None = None,
 ) -> Guard:
     """The service around one monitor that is loaded and warmed up.
 
@@ -55,6 +58,7 @@ def create_app(
         api_key: the key that every request but the health checks must carry; None asks for none.
         max_body: most bytes of a request's body; a batch's may be `BATCH_BODY` times as large.
         recorder: what records the decisions, if any does.
+        memory_key: seals the robots' memories, see `Keeper`; None: one made at random.
     """
     state = lifecycle or Lifecycle()
     model = ModelReply.of(monitor)
@@ -94,7 +98,10 @@ def create_app(
         return JSONResponse({"status": "ready"})
 
     observers: list[Observer] = [] if recorder is None else [Recording(recorder)]
-    return Guard(Desk(app, monitor, model, observers), api_key, max_body, {BATCH: BATCH_BODY * max_body})
+    keeper = Keeper(memory_key or secrets.token_bytes(KEY_BYTES), monitor.faults)
+    return Guard(
+        Desk(app, monitor, model, keeper, observers), api_key, max_body, {BATCH: BATCH_BODY * max_body}
+    )
 
 
 def _act_schema(model: ModelReply) -> dict[str, Any]:

@@ -14,15 +14,16 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ValidationError
-from pydantic_core import from_json
+from pydantic_core import from_json, to_json
 from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from decision import MEMORY, Decision, Memory, memory_from_json
+from decision import MEMORY, Decision
 from monitor import Monitor
 from server.guard import ACT, AT_ONCE, BATCH, BodyTooLargeError
+from server.keeper import Keeper, Past
 from server.observer import Answered, Observer
-from server.schema import ActRequest, BatchReply, BatchRequest, ModelReply, Refusal, Reply, reply_of
+from server.schema import ActRequest, BatchRequest, ModelReply, reply_of
 
 FloatArray = NDArray[np.float64]
 
@@ -72,15 +73,22 @@ class Desk:
         app: what answers the other paths.
         monitor: what decides.
         model: what it told of itself.
+        keeper: looks through the memories that come back.
         observers: told of every answer, in order.
     """
 
     def __init__(
-        self, app: ASGIApp, monitor: Monitor, model: ModelReply, observers: Sequence[Observer] = ()
+        self,
+        app: ASGIApp,
+        monitor: Monitor,
+        model: ModelReply,
+        keeper: Keeper,
+        observers: Sequence[Observer] = (),
     ) -> None:
         self._app = app
         self._monitor = monitor
         self._model = model
+        self._keeper = keeper
         self._observers = observers
         self._thread = ThreadPoolExecutor(1, "decisions")
         self._quick = 0
@@ -128,50 +136,63 @@ class Desk:
         """Answers the body of `POST /act/batch`."""
         return self._guarded(lambda: self._decide_batch(content, started))
 
-    def _guarded(self, decide: Callable[[], tuple[BaseModel, list[ActRequest], list[Decision]]]) -> Answer:
+    def _guarded(
+        self, decide: Callable[[], tuple[dict[str, Any], list[ActRequest], list[Decision]]]
+    ) -> Answer:
         try:
             reply, asked, decisions = decide()
-            return Answer(200, reply.model_dump_json().encode(), asked, decisions)
+            return Answer(200, to_json(reply), asked, decisions)
         except RefusedError as error:
             return _problem(422, error.errors)
         except Exception as error:  # noqa: BLE001 - counted and logged; the client has a fallback of its own
             self._monitor.faults.note(type(error).__name__, "the decision could not be told", error)
             return _problem(500, [([], "internal error", "internal")])
 
-    def _decide(self, content: bytes, started: float) -> tuple[BaseModel, list[ActRequest], list[Decision]]:
-        asked, memory = self._read(lambda: ActRequest.model_validate_json(content))
-        decision = self._monitor.decide(asked.observation, asked.hazards, memory)
-        return self._told(decision, asked, started), [asked], [decision]
+    def _decide(
+        self, content: bytes, started: float
+    ) -> tuple[dict[str, Any], list[ActRequest], list[Decision]]:
+        asked, past = self._read(lambda: ActRequest.model_validate_json(content))
+        decision = self._monitor.decide(asked.observation, asked.hazards, past.memory, past.lost)
+        return self._told(decision, asked, past, started), [asked], [decision]
 
     def _decide_batch(
         self, content: bytes, started: float
-    ) -> tuple[BaseModel, list[ActRequest], list[Decision]]:
+    ) -> tuple[dict[str, Any], list[ActRequest], list[Decision]]:
         """One call of the monitor for all robots whose requests are in order; the others are told why not."""
-        replies: list[Reply | Refusal] = []
-        rows: list[tuple[int, ActRequest, Memory | None]] = []
-        told: list[Decision] = []
+        replies: list[dict[str, Any]] = []
+        rows: list[tuple[int, ActRequest, Past]] = []
+        told: dict[int, tuple[ActRequest, Past, Decision]] = {}
         batch = _validated(lambda: BatchRequest.model_validate(_parsed(content)))
         for place, robot in enumerate(batch.robots):
+            replies.append({})
             try:
-                rows.append((place, *self._read(partial(ActRequest.model_validate, robot))))
-                replies.append(Refusal(detail=[]))
+                asked, past = self._read(partial(ActRequest.model_validate, robot))
             except RefusedError as error:
-                replies.append(Refusal(detail=_detail(error.errors)))
+                replies[place] = {"detail": _detail(error.errors)}
+                continue
+            if past.lost is None:
+                rows.append((place, asked, past))
+            else:
+                decision = self._monitor.decide(asked.observation, asked.hazards, past.memory, past.lost)
+                told[place] = asked, past, decision
         if rows:
             decisions = self._monitor.decide_batch(
                 np.array([asked.observation for _, asked, _ in rows]),
                 _hazards([asked.hazards or [] for _, asked, _ in rows]),
-                np.concatenate([np.zeros(1, MEMORY) if memory is None else memory for _, _, memory in rows]),
+                np.concatenate(
+                    [np.zeros(1, MEMORY) if it.memory is None else it.memory for _, _, it in rows]
+                ),
             )
             most = max(len(asked.hazards or []) for _, asked, _ in rows)
-            for row, (place, asked, _) in enumerate(rows):
-                decision = _of_its_own(decisions[row], len(asked.hazards or []), most)
-                replies[place] = self._told(decision, asked, started)
-                told.append(decision)
-        return BatchReply(replies=replies), [asked for _, asked, _ in rows], told
+            for row, (place, asked, past) in enumerate(rows):
+                told[place] = asked, past, _of_its_own(decisions[row], len(asked.hazards or []), most)
+        for place, (asked, past, decision) in told.items():
+            replies[place] = self._told(decision, asked, past, started)
+        in_order = [told[place] for place in sorted(told)]
+        return {"replies": replies}, [it[0] for it in in_order], [it[2] for it in in_order]
 
-    def _read(self, validate: Callable[[], ActRequest]) -> tuple[ActRequest, Memory | None]:
-        """One robot's request, and its memory.
+    def _read(self, validate: Callable[[], ActRequest]) -> tuple[ActRequest, Past]:
+        """One robot's request, and what to go by.
 
         Raises:
             RefusedError: if it cannot be decided about.
@@ -181,14 +202,13 @@ class Desk:
         if len(asked.observation) != size:
             message = f"must have {size} numbers, got {len(asked.observation)}"
             raise RefusedError([(["observation"], message, "wrong_length")])
-        try:
-            return asked, None if asked.memory is None else memory_from_json(asked.memory.model_dump())
-        except ValueError as error:
-            raise RefusedError([(["memory"], str(error), "wrong_memory")]) from error
+        return asked, self._keeper.past(asked.memory, asked.played, asked.robot, self._model.model)
 
-    def _told(self, decision: Decision, asked: ActRequest, started: float) -> Reply:
+    def _told(self, decision: Decision, asked: ActRequest, past: Past, started: float) -> dict[str, Any]:
+        model = self._model
+        memory = self._keeper.seal(decision.memory, asked.robot, model.model, past)
         seconds = time.perf_counter() - started
-        return reply_of(decision, asked.request, self._model.model, self._model.gate, seconds)
+        return reply_of(decision, memory, asked.request, model.model, model.gate, seconds)
 
 
 def _validated(validate: Callable[[], Validated]) -> Validated:

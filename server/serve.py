@@ -28,6 +28,7 @@ from recorder import Recorder, RecordingError, Settings
 from server.app import MAX_BODY, Lifecycle, create_app
 from server.door import Connection, Door, Patience
 from server.guard import Guard
+from server.keeper import KEY_BYTES
 from server.schema import ModelReply
 
 KEY_VARIABLE = "LAGNET_API_KEY"
@@ -76,6 +77,9 @@ class ServeConfig:
     """How old observations are and how late actions take effect, together, in control steps."""
     api_key_file: Path | None = None
     """File that holds the key; otherwise the environment variable LAGNET_API_KEY."""
+    memory_key_file: Path | None = None
+    """File with at least 32 bytes by which robots' memories are sealed: services that share it take each
+    other's, and a restart loses none. By default a key made at random."""
     max_body: int = MAX_BODY
     """Most bytes of a request's body; more is refused with 413."""
     max_connections: int = 512
@@ -237,6 +241,23 @@ def read_api_key(path: Path | None) -> str | None:
     return key
 
 
+def read_memory_key(path: Path | None) -> bytes | None:
+    """The key that seals memories, if a file holds one.
+
+    Raises:
+        ServeError: if the file cannot be read, or has too few bytes.
+    """
+    if path is None:
+        return None
+    try:
+        key = path.read_bytes()
+    except OSError as error:
+        raise ServeError(f"--memory-key-file {path}: cannot be read: {error.strerror}") from error
+    if len(key) < KEY_BYTES:
+        raise ServeError(f"--memory-key-file {path} must hold at least {KEY_BYTES} bytes, has {len(key)}")
+    return key
+
+
 def allow_files(connections: int) -> None:
     """Allows this process as many open files as so many robots and newcomers take.
 
@@ -268,6 +289,7 @@ def serve(config: ServeConfig) -> None:
     """
     config.check()
     api_key = read_api_key(config.api_key_file)
+    memory_key = read_memory_key(config.memory_key_file)
     allow_files(config.max_connections)
     listener = listen(config.host, config.port, api_key)
     with listener:
@@ -281,7 +303,7 @@ def serve(config: ServeConfig) -> None:
         gate = {"gate": monitor.gate.name, "threshold": monitor.gate.threshold, "guide": config.guide}
         announcement = json.dumps(ready | gate)
         with recorder_of(config, monitor) as recorder:
-            app = create_app(monitor, lifecycle, api_key, config.max_body, recorder)
+            app = create_app(monitor, lifecycle, api_key, config.max_body, recorder, memory_key)
             # What is loaded stays: looking through it again and again for garbage would hold up decisions.
             gc.collect()
             gc.freeze()
