@@ -45,7 +45,7 @@ MEMORY = np.dtype(
         ("guided", "i1"),
         ("planned", "?"),
         ("history", HISTORY),
-        ("seal", "i8", 3),
+        ("seal", "i8", 4),
     ],
     align=True,
 )
@@ -58,7 +58,8 @@ MEMORY = np.dtype(
 - ``planned``: whether there is a certified plan; one without actions is to coast.
 - ``left``: how many actions of the plan are left.
 - ``history``: see `HISTORY`.
-- ``seal``: by what a service knows a memory that it sent: its number, and a tag; zeros: none has.
+- ``seal``: by what a service knows a memory that it sent: its number, that
+  of the first of a robot without a name, and a tag; zeros: none has.
 - ``plan``: (PLAN_STEPS, 2) what is left of the certified backup, action by action; after it the robot coasts.
 """
 

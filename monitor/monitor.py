@@ -138,11 +138,7 @@ class Monitor:
         return Monitor(bundle, networks, action_filter, gate, threshold, guide, watch)
 
     def decide(
-        self,
-        observation: ArrayLike,
-        hazards: ArrayLike | None = None,
-        memory: Memory | np.void | None = None,
-        lost: str | None = None,
+        self, observation: ArrayLike, hazards: ArrayLike | None = None, memory: Memory | np.void | None = None
     ) -> Decision:
         """Decides for one robot.
 
@@ -151,11 +147,15 @@ class Monitor:
             hazards: (n, 2), centres of hazards in the body frame [m], x ahead, y left; None or none at all:
                 what the lidar shows. Hazards that the lidar shows beside the given ones count as well.
             memory: the `memory` of this robot's last decision; None before its first.
-            lost: why this is not what the robot's last decision left, or None: with it nothing nominal is
-                sent, and the mode is "fallback".
 
         A bad input or any fault inside gives mode "fallback" with the reason.
         """
+        return self.decide_lost(observation, hazards, memory, None)
+
+    def decide_lost(
+        self, observation: ArrayLike, hazards: ArrayLike | None, memory: Any, lost: str | None
+    ) -> Decision:
+        """`decide` for a robot whose memory is ``lost``, and why: then nothing nominal is sent."""
         try:
             past = memory_of(1, memory)
         except ValueError as error:
@@ -193,17 +193,15 @@ class Monitor:
     def _decide_or_fall_back(
         self, observation: FloatArray, hazards: FloatArray | None, memory: Memory, lost: str | None = None
     ) -> Decisions:
-        """Decides; ``lost`` says that the memory was lost, and why: then nothing nominal is sent."""
+        """Decides, whatever happens; ``lost`` as in `decide_lost`."""
         try:
             return self._decide(observation, hazards, memory, lost)
         except Exception as error:  # noqa: BLE001 - whatever it is, the robot needs an action
             if len(observation) <= 1:
                 return self._fall_back(memory, self._note(error))
-        # Something in one row spoils the batch: decide one by one, so that only its own robot gets the
-        # fallback.
+        # Something in one row spoils the batch: one by one, only its own robot gets the fallback.
         rows = [slice(i, i + 1) for i in range(len(observation))]
-        near = [None if hazards is None else hazards[i] for i in rows]
-        alone = zip((observation[i] for i in rows), near, (memory[i] for i in rows), strict=True)
+        alone = [(observation[i], None if hazards is None else hazards[i], memory[i]) for i in rows]
         return Decisions.join([self._decide_or_fall_back(*robot) for robot in alone])
 
     def _decide(

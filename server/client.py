@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from decision import Decision, Faults, Memory
@@ -44,9 +45,11 @@ class Client:
             so many fallbacks. Connecting here may take 5 s; the host's name is looked up here, once.
         api_key: sent as `Authorization: Bearer`.
         robot: the robot's name. The service then knows a memory that is not its last, and a sensor that was
-            caught stays so until it is told otherwise. None: a name at random, anew with each first step.
+            caught stays so until it is told otherwise. None: both hold until a step without memory alone.
         most_failures: failures in a row after which it holds; None: never. By default half a second's.
         raises: raise `server.session.StepError`, which carries the fallback, instead of returning it.
+        clock: the robot's clock [s], which stamps every request at `decide`; for a service that looks at
+            stamps. None: none is sent.
         ca_file: certificates by which https is verified; None: the system's.
 
     Attributes:
@@ -68,11 +71,12 @@ class Client:
         robot: str | None = None,
         most_failures: int | None = MOST_FAILURES,
         raises: bool = False,
+        clock: Callable[[], float] | None = None,
         ca_file: str | Path | None = None,
     ) -> None:
         if not (math.isfinite(timeout) and timeout > 0.0):
             raise ValueError(f"timeout must be finite and positive, got {timeout}")
-        self._session = Session(observation_layout, robot, most_failures, raises)
+        self._session = Session(observation_layout, robot, most_failures, raises, clock)
         self._timeout = timeout
         self._links = [
             (address, _link(address, self._session)) for address in addresses(url, api_key, ca_file)
@@ -101,8 +105,7 @@ class Client:
         self,
         observation: ArrayLike,
         hazards: ArrayLike | None = None,
-        memory: Memory | Any | None = None,
-        stamp: float | None = None,
+        memory: Memory | np.void | None = None,
     ) -> Decision:
         """Asks the service to decide.
 
@@ -111,14 +114,13 @@ class Client:
             hazards: (n, 2), centres in the body frame [m]; None or none at all: what the lidar shows.
             memory: the `memory` of this robot's last decision, the client's own included; None before its
                 first.
-            stamp: when the observation was made, by the robot's clock [s]; for a service that looks at it.
 
         Returns:
             The service's decision. Where there is none: mode "fallback", origin "plan", opened by "fault",
             and the reason.
         """
         try:
-            return self._ask(self._session.ask(observation, hazards, memory, stamp))
+            return self._ask(self._session.ask(observation, hazards, memory))
         except Exception as error:  # noqa: BLE001 - whatever it is, the robot needs an action
             return self._session.failed(error, self._timeout)
 

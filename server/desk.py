@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -11,12 +10,13 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple, TypeVar
 
+import msgpack
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ValidationError
 from pydantic_core import from_json, to_json
 from starlette.requests import ClientDisconnect
-from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from decision import MEMORY, Decision
 from monitor import Monitor
@@ -48,6 +48,25 @@ class Answer(NamedTuple):
 Problem = tuple[list[str | int], str, str]
 """Where in the body, what is wrong, and its kind."""
 Validated = TypeVar("Validated", bound=BaseModel)
+
+
+class Codec(NamedTuple):
+    """How the body of a request is read, and that of its answer written."""
+
+    read: Callable[[bytes], ActRequest]
+    write: Callable[[Any], bytes]
+
+
+def _from_msgpack(content: bytes) -> ActRequest:
+    try:
+        unpacked = msgpack.unpackb(content)
+    except ValueError as error:
+        raise RefusedError([([], f"Invalid msgpack: {error}", "msgpack_invalid")]) from error
+    return ActRequest.model_validate(unpacked)
+
+
+JSON = Codec(ActRequest.model_validate_json, to_json)
+MSGPACK = Codec(_from_msgpack, msgpack.packb)
 
 
 class RefusedError(ValueError):
@@ -95,64 +114,123 @@ class Desk:
         self._answers = {ACT: self._one, BATCH: self._batch}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Handles one request."""
-        answers = self._answers.get(scope["path"]) if scope["type"] == "http" else None
-        if answers is None or scope["method"] != "POST":
+        """Handles one request, or one stream of them."""
+        path = scope["path"]
+        if scope["type"] == "websocket":
+            await self._stream(scope, receive, send)
+            return
+        if scope["type"] != "http" or path not in self._answers or scope["method"] != "POST":
             await self._app(scope, receive, send)
             return
         started = time.perf_counter()
-        content = b""
-        received = time.time_ns()
+        client = scope.get("client")
         try:
-            content = await _body(receive)
-            received = time.time_ns()
-            if self._quick >= _QUICK_ENOUGH and scope["path"] == ACT:
-                answer = answers(content, started)
-            else:
-                loop = asyncio.get_running_loop()
-                answer = await loop.run_in_executor(self._thread, answers, content, started)
+            answer = await self.handle(path, await _body(receive), started, client)
         except BodyTooLargeError as error:
             answer = _problem(413, [([], str(error), "too_large")])
-        if self._observers:
-            seconds = time.perf_counter() - started
-            client = scope.get("client")
-            answered = Answered(received, client, scope["path"], content, seconds, *answer)
-            for observer in self._observers:
-                observer.answered(answered)
+            self._tell(time.time_ns(), client, path, b"", started, answer)
         await _reply(scope, send, answer.status, answer.body)
+
+    async def _stream(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answers one robot's frames in their order, until it hangs up.
+
+        Each frame is the body of a `POST /act`, each answer that of its reply: text frames are JSON, binary
+        ones msgpack.
+        """
+        await receive()
+        await send({"type": "websocket.accept"})
+        client = scope.get("client")
+        while (message := await receive())["type"] == "websocket.receive":
+            started = time.perf_counter()
+            text = message.get("text")
+            reply: Message = {"type": "websocket.send"}
+            if text is not None:
+                answer = await self.handle(ACT, text.encode(), started, client)
+                reply["text"] = answer.body.decode()
+            else:
+                answer = await self.handle(ACT, message["bytes"], started, client, MSGPACK)
+                reply["bytes"] = answer.body
+            await send(reply)
+
+    async def handle(
+        self,
+        path: str,
+        content: bytes,
+        started: float,
+        client: tuple[str, int] | None,
+        codec: Codec = JSON,
+    ) -> Answer:
+        """The answer to one body, of which whoever looks on is told.
+
+        Args:
+            path: "/act" or "/act/batch".
+            content: the body.
+            started: when its request began, on the clock of `time.perf_counter` [s].
+            client: address and port of who asks.
+            codec: how bodies are written; a batch's are JSON.
+        """
+        received = time.time_ns()
+        answers = self._one if path == ACT else self._batch
+        if self._quick >= _QUICK_ENOUGH and path == ACT:
+            answer = answers(content, started, codec)
+        else:
+            loop = asyncio.get_running_loop()
+            answer = await loop.run_in_executor(self._thread, answers, content, started, codec)
+        if self._observers:
+            self._tell(received, client, path, content, started, answer, codec)
+        return answer
+
+    def _tell(
+        self,
+        received: int,
+        client: tuple[str, int] | None,
+        path: str,
+        content: bytes,
+        started: float,
+        answer: Answer,
+        codec: Codec = JSON,
+    ) -> None:
+        """Tells whoever looks on of an answer, in JSON."""
+        seconds = time.perf_counter() - started
+        if codec is not JSON:
+            content = b"".join(asked.model_dump_json().encode() for asked in answer.asked[:1])
+            answer = answer._replace(body=to_json(msgpack.unpackb(answer.body)))
+        answered = Answered(received, client, path, content, seconds, *answer)
+        for observer in self._observers:
+            observer.answered(answered)
 
     def answer(self, content: bytes, batch: bool) -> Answer:
         """The answer to the body of a `POST /act`, or of a `POST /act/batch`."""
-        return self._answers[BATCH if batch else ACT](content, time.perf_counter())
+        return self._answers[BATCH if batch else ACT](content, time.perf_counter(), JSON)
 
-    def _one(self, content: bytes, started: float) -> Answer:
+    def _one(self, content: bytes, started: float, codec: Codec) -> Answer:
         """Answers the body of `POST /act`."""
         begun = time.perf_counter()
-        answer = self._guarded(lambda: self._decide(content, started))
+        answer = self._guarded(lambda: self._decide(content, started, codec), codec)
         self._quick = self._quick + 1 if time.perf_counter() - begun < _QUICK else 0
         return answer
 
-    def _batch(self, content: bytes, started: float) -> Answer:
+    def _batch(self, content: bytes, started: float, codec: Codec) -> Answer:
         """Answers the body of `POST /act/batch`."""
-        return self._guarded(lambda: self._decide_batch(content, started))
+        return self._guarded(lambda: self._decide_batch(content, started), codec)
 
     def _guarded(
-        self, decide: Callable[[], tuple[dict[str, Any], list[ActRequest], list[Decision]]]
+        self, decide: Callable[[], tuple[dict[str, Any], list[ActRequest], list[Decision]]], codec: Codec
     ) -> Answer:
         try:
             reply, asked, decisions = decide()
-            return Answer(200, to_json(reply), asked, decisions)
+            return Answer(200, codec.write(reply), asked, decisions)
         except RefusedError as error:
-            return _problem(422, error.errors)
+            return _problem(422, error.errors, codec)
         except Exception as error:  # noqa: BLE001 - counted and logged; the client has a fallback of its own
             self._monitor.faults.note(type(error).__name__, "the decision could not be told", error)
-            return _problem(500, [([], "internal error", "internal")])
+            return _problem(500, [([], "internal error", "internal")], codec)
 
     def _decide(
-        self, content: bytes, started: float
+        self, content: bytes, started: float, codec: Codec
     ) -> tuple[dict[str, Any], list[ActRequest], list[Decision]]:
-        asked, past = self._read(lambda: ActRequest.model_validate_json(content))
-        decision = self._monitor.decide(asked.observation, asked.hazards, past.memory, past.lost)
+        asked, past = self._read(lambda: codec.read(content))
+        decision = self._decide_one(asked, past)
         return self._told(decision, asked, past, started), [asked], [decision]
 
     def _decide_batch(
@@ -173,7 +251,7 @@ class Desk:
             if past.lost is None:
                 rows.append((place, asked, past))
             else:
-                decision = self._monitor.decide(asked.observation, asked.hazards, past.memory, past.lost)
+                decision = self._decide_one(asked, past)
                 told[place] = asked, past, decision
         if rows:
             decisions = self._monitor.decide_batch(
@@ -190,6 +268,11 @@ class Desk:
             replies[place] = self._told(decision, asked, past, started)
         in_order = [told[place] for place in sorted(told)]
         return {"replies": replies}, [it[0] for it in in_order], [it[2] for it in in_order]
+
+    def _decide_one(self, asked: ActRequest, past: Past) -> Decision:
+        if past.lost is None:
+            return self._monitor.decide(asked.observation, asked.hazards, past.memory)
+        return self._monitor.decide_lost(asked.observation, asked.hazards, past.memory, past.lost)
 
     def _read(self, validate: Callable[[], ActRequest]) -> tuple[ActRequest, Past]:
         """One robot's request, and what to go by.
@@ -269,9 +352,9 @@ async def _reply(scope: Scope, send: Send, status: int, content: bytes) -> None:
     await send({"type": "http.response.body", "body": content})
 
 
-def _problem(status: int, errors: list[Problem]) -> Answer:
-    """An error in FastAPI's form."""
-    return Answer(status, json.dumps({"detail": _detail(errors)}).encode())
+def _problem(status: int, errors: list[Problem], codec: Codec = JSON) -> Answer:
+    """An error in FastAPI's form, and its status, which a frame does not have beside it."""
+    return Answer(status, codec.write({"status": status, "detail": _detail(errors)}))
 
 
 def _detail(errors: list[Problem]) -> list[dict[str, Any]]:

@@ -11,7 +11,7 @@ from typing import Any
 from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-ACT, BATCH = "/act", "/act/batch"
+ACT, BATCH, STREAM = "/act", "/act/batch", "/act/stream"
 OPEN_PATHS = frozenset({"/healthz", "/readyz"})
 """What an orchestrator may ask without a key."""
 AT_ONCE = "lagnet.at_once"
@@ -19,6 +19,8 @@ AT_ONCE = "lagnet.at_once"
 FULL = "lagnet.full"
 """The ASGI extension that says whether there is no place for one more robot."""
 
+_HANDSHAKE = "websocket.http.response"
+"""What messages are called that answer a WebSocket's handshake with a reply."""
 _MAX_DIGITS = 18
 
 
@@ -46,10 +48,10 @@ class Guard:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Handles one connection."""
-        if scope["type"] != "http":
-            await self._app(scope, receive, send)
-            return
         headers: dict[bytes, bytes] = dict(scope["headers"])
+        if scope["type"] == "websocket":
+            await self._stream(headers, scope, receive, send)
+            return
         if scope["path"] not in OPEN_PATHS and not self._admits(headers):
             await _refuse(send, 401, "header", "authorization", "a valid API key is required")
             return
@@ -68,9 +70,22 @@ class Guard:
         with suppress(ClientDisconnect):
             await self._app(scope, receive, send)
 
+    async def _stream(
+        self, headers: Mapping[bytes, bytes], scope: Scope, receive: Receive, send: Send
+    ) -> None:
+        if scope["path"] != STREAM:
+            await _refuse(send, 404, "path", scope["path"], f"the stream is at {STREAM}", _HANDSHAKE)
+        elif not self._admits(headers):
+            await _refuse(send, 401, "header", "authorization", "a valid API key is required", _HANDSHAKE)
+        elif b"origin" in headers:
+            # Browsers let any page open a stream to any host, and say whose page it is.
+            await _refuse(send, 403, "header", "origin", "the stream is not for browsers", _HANDSHAKE)
+        else:
+            await self._app(scope, receive, send)
+
     def is_robots(self, scope: Mapping[str, Any]) -> bool:
         """Whether a request is one that only a robot makes: for a decision, with the key."""
-        return scope["path"] in (ACT, BATCH) and self._admits(dict(scope["headers"]))
+        return scope["path"] in (ACT, BATCH, STREAM) and self._admits(dict(scope["headers"]))
 
     def _admits(self, headers: Mapping[bytes, bytes]) -> bool:
         return self._key is None or _carries(headers, self._key)
@@ -102,7 +117,9 @@ def _carries(headers: Mapping[bytes, bytes], key: bytes) -> bool:
     return hmac.compare_digest(given, key)
 
 
-async def _refuse(send: Send, status: int, place: str, name: str, message: str) -> None:
+async def _refuse(
+    send: Send, status: int, place: str, name: str, message: str, kind: str = "http.response"
+) -> None:
     """Answers a request that is not read, and closes its connection."""
     detail = [{"loc": [place, name], "msg": message, "type": "refused"}]
     body = json.dumps({"detail": detail}).encode()
@@ -113,5 +130,5 @@ async def _refuse(send: Send, status: int, place: str, name: str, message: str) 
         headers.append((b"retry-after", b"1"))
     # The body was not read: the connection cannot carry another request.
     headers.append((b"connection", b"close"))
-    await send({"type": "http.response.start", "status": status, "headers": headers})
-    await send({"type": "http.response.body", "body": body})
+    await send({"type": f"{kind}.start", "status": status, "headers": headers})
+    await send({"type": f"{kind}.body", "body": body})

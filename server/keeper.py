@@ -2,9 +2,9 @@
 
 Memory travels with the robot, so that any of several services can decide next. A plan in it may be played
 without another look at the world: one that is forged, or of another moment, would lead anywhere. So each
-memory that leaves carries a number and a tag. What comes back with a wrong tag is lost. Of a robot that has a
-name the service also remembers the last memory, so that an older one is told from it, and a sensor that was
-caught stays caught though its robot forgets it.
+memory that leaves carries a number and a tag. What comes back with a wrong tag is lost. The service also
+remembers each robot's last memory, so that an older one is told from it, and if the robot has a name, a
+sensor that was caught stays caught though its robot forgets it.
 """
 
 from __future__ import annotations
@@ -21,15 +21,17 @@ import numpy as np
 from decision import MEMORY, PLAN_STEPS, Faults, Memory, fall_back, pack, unpack
 
 MOST_ROBOTS = 4096
-"""Robots by name whose last memory is remembered; of more, whoever asked longest ago goes, and those last
-that have a sensor caught."""
+"""Robots whose last memory is remembered; of more, whoever asked longest ago goes, and last those that have a
+sensor caught."""
 KEY_BYTES = 32
 """Least length of a key, and that of one made at random."""
 
 _STEP = 20_000_000
 """A control step [ns]: no robot has gone on by itself for more steps than have passed."""
 _NUMBER = MEMORY.fields["seal"][1] if MEMORY.fields else 0
-_TAG = _NUMBER + 8
+_FIRST, _TAG = _NUMBER + 8, _NUMBER + 16
+Who = str | int
+"""A robot by its name, or by the number of its first memory."""
 
 
 class Past(NamedTuple):
@@ -57,7 +59,7 @@ class Keeper:
     def __init__(self, key: bytes, faults: Faults) -> None:
         self._key = blake2b(key).digest()
         self._faults = faults
-        self._last: dict[str, bytes] = {}
+        self._last: dict[Who, bytes] = {}
         self._lock = Lock()
 
     def past(self, text: str | None, played: int, robot: str | None, bundle: str) -> Past:
@@ -79,9 +81,11 @@ class Keeper:
         data = memory.tobytes()
         if not hmac.compare_digest(data[_TAG:], self._tag(data[:_TAG], bundle, robot)):
             return self._lost("the memory is not one that this service sent", last)
-        if last is not None and _number(data) < _number(last):
-            self._faults.note("memory", f"{robot} came with an older memory than its last")
+        if robot is None:
+            last = self._last.get(_word(data, _FIRST))
+        if last is not None and _word(data, _NUMBER) < _word(last, _NUMBER):
             # It may not have had the last reply: what it has done since is not known.
+            self._faults.note("memory", f"{robot or 'a robot'} came with an older memory than its last")
             return Past(_apart(last), None, last)
         return Past(_gone_on(memory, played) if played else memory, None, last)
 
@@ -94,12 +98,13 @@ class Keeper:
             bundle: the bundle's id.
             past: what the decision went by.
         """
-        before = 0 if past.memory is None else int(past.memory["seal"][0, 0])
-        number = max(time.time_ns(), before + 1, 0 if past.last is None else _number(past.last) + 1)
-        data = memory.tobytes()[:_NUMBER] + struct.pack("<q", number)
+        before, first = (0, 0) if past.memory is None else past.memory["seal"][0, :2].tolist()
+        number = max(time.time_ns(), before + 1, 0 if past.last is None else _word(past.last, _NUMBER) + 1)
+        who: Who = robot or first or number
+        data = memory.tobytes()[:_NUMBER] + struct.pack("<qq", number, 0 if robot else who)
         data += self._tag(data, bundle, robot)
-        if robot is not None:
-            self._remember(robot, data, past.last)
+        if who != number:  # whoever never brings a memory is nobody to remember
+            self._remember(who, data, past.last)
         return pack(data)
 
     def forget(self, robot: str) -> bool:
@@ -113,27 +118,29 @@ class Keeper:
 
     def _without(self, last: bytes, robot: str | None) -> Past:
         """A robot that is known comes without its memory: it starts anew, unless a sensor was caught."""
-        self._faults.note("memory", f"{robot} came without its memory")
-        return Past(_apart(last) if _is_doubted(last) else None, None, last)
+        if not _is_doubted(last):
+            return Past(None, None, last)
+        self._faults.note("memory", f"{robot} forgot that a sensor of it was caught")
+        return Past(_apart(last), None, last)
 
     def _lost(self, why: str, last: bytes | None) -> Past:
         self._faults.note("memory", why)
         return Past(None if last is None else _apart(last), why, last)
 
-    def _remember(self, robot: str, data: bytes, last: bytes | None) -> None:
+    def _remember(self, who: Who, data: bytes, last: bytes | None) -> None:
         with self._lock:
-            if self._last.get(robot) is not last:
+            if self._last.get(who) is not last:
                 return  # a later request was answered before this one
-            self._last.pop(robot, None)
+            self._last.pop(who, None)
             if len(self._last) >= MOST_ROBOTS:
                 trusted = (name for name, known in self._last.items() if not _is_doubted(known))
                 del self._last[next(trusted, next(iter(self._last)))]
-            self._last[robot] = data
+            self._last[who] = data
 
 
-def _number(data: bytes) -> int:
-    number: int = struct.unpack_from("<q", data, _NUMBER)[0]
-    return number
+def _word(data: bytes, place: int) -> int:
+    word: int = struct.unpack_from("<q", data, place)[0]
+    return word
 
 
 def _is_doubted(data: bytes) -> bool:

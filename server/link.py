@@ -11,7 +11,7 @@ import socket
 import ssl
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 MAX_REPLY = 256 * 1024
 """Most bytes of a reply, its head included; a real one has one or two thousand."""
@@ -212,22 +212,29 @@ class Link:
         raise fault or OSError("the host has no address")
 
     def _reach(self, found: tuple[Any, ...], timeout: float) -> Connected:
-        family, kind, protocol, _, address = found
-        opened = DeadlineSocket(family, kind, protocol)
         deadline = time.monotonic() + timeout
+        opened = _open(found, timeout)
+        if self._tls is None:
+            return opened
         try:
-            opened.settimeout(timeout)
-            opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            opened.connect(address)
-            if self._tls is None:
-                return opened
             opened.settimeout(remaining(deadline))
-            secured = self._tls.wrap_socket(opened, server_hostname=self._address[0])
+            return cast(DeadlineTLSSocket, self._tls.wrap_socket(opened, server_hostname=self._address[0]))
         except BaseException:
             opened.close()
             raise
-        assert isinstance(secured, DeadlineTLSSocket)
-        return secured
+
+
+def _open(found: tuple[Any, ...], timeout: float) -> DeadlineSocket:
+    family, kind, protocol, _, address = found
+    opened = DeadlineSocket(family, kind, protocol)
+    try:
+        opened.settimeout(timeout)
+        opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        opened.connect(address)
+    except BaseException:
+        opened.close()
+        raise
+    return opened
 
 
 def _silent(connection: socket.socket) -> bool:

@@ -30,6 +30,7 @@ from server.door import Connection, Door, Patience
 from server.guard import Guard
 from server.keeper import KEY_BYTES
 from server.schema import ModelReply
+from server.streaming import StreamConnection
 
 KEY_VARIABLE = "LAGNET_API_KEY"
 """Environment variable that may hold the key."""
@@ -328,7 +329,10 @@ def _server(app: Guard, lifecycle: Lifecycle, config: ServeConfig, announcement:
         access_log=False,
         log_level="error",  # warnings are of what anybody may send, a line each
         lifespan="off",
-        ws="none",
+        ws=StreamConnection,
+        ws_max_size=config.max_body,
+        ws_ping_interval=None,  # whoever is silent has a deadline
+        ws_per_message_deflate=False,  # it would take longer than the decision
         server_header=False,
         http=Connection,
         timeout_keep_alive=math.ceil(config.idle_seconds),

@@ -6,8 +6,7 @@ What is asked, what of a reply is believed, and what is done without one. Client
 from __future__ import annotations
 
 import http.client
-import secrets
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
@@ -75,9 +74,10 @@ class Session:
 
     Args:
         observation_layout: what this robot sends; None compares each observation's length alone.
-        robot: the robot's name; None: one at random for each life, which a step without memory begins.
+        robot: the robot's name; None: it has none.
         most_failures: after so many failures in a row it holds; None: never.
         raises: whether a step without a good reply raises.
+        clock: stamps requests; None: they have no stamp.
 
     Attributes:
         faults: what went wrong so far.
@@ -94,18 +94,17 @@ class Session:
         robot: str | None = None,
         most_failures: int | None = MOST_FAILURES,
         raises: bool = False,
+        clock: Callable[[], float] | None = None,
     ) -> None:
         if most_failures is not None and most_failures < 1:
             raise ValueError(f"most_failures must be at least 1, got {most_failures}")
         self.faults = Faults("lagnet.client")
         self.held: str | None = None
         self._layout = observation_layout
-        self._named = robot
         self._robot = robot
-        self._lived = False
-        """Whether the robot of this name has brought a memory, or has a sensor that was caught."""
         self._most_failures = most_failures
         self._raises = raises
+        self._clock = clock
         self.met: ModelReply | None = None
         self._failures = 0
         self._request = 0
@@ -150,11 +149,7 @@ class Session:
         self.met = model
 
     def ask(
-        self,
-        observation: ArrayLike,
-        hazards: ArrayLike | None,
-        memory: Memory | np.void | None,
-        stamp: float | None,
+        self, observation: ArrayLike, hazards: ArrayLike | None, memory: Memory | np.void | None
     ) -> bytes:
         """The body of the next request.
 
@@ -166,8 +161,8 @@ class Session:
         try:
             if memory is not None:
                 self._past = self._one_robots(memory)
-            body = self._body(observation, hazards, stamp)
-        except (TypeError, ValueError) as error:
+            body = self._body(observation, hazards)
+        except Exception as error:  # whatever cannot be made a number
             raise InputError(str(error) or type(error).__name__) from error
         if self.held is not None:
             raise HeldError(self.held)
@@ -200,7 +195,6 @@ class Session:
             raise ReplyError("the reply has another plan than its memory")
         self._failures = 0
         self._sealed = Sealed(decision.memory.tobytes(), reply.memory, 0)
-        self._lived |= bool(decision.memory["history"]["doubted"])
         return decision
 
     def failed(self, error: Exception, timeout: float) -> Decision:
@@ -246,7 +240,7 @@ class Session:
             raise ValueError("the memory's plan has an action that is none")
         return one
 
-    def _body(self, observation: ArrayLike, hazards: ArrayLike | None, stamp: float | None) -> bytes:
+    def _body(self, observation: ArrayLike, hazards: ArrayLike | None) -> bytes:
         numbers = _numbers("observation", observation)
         size = self.model.observation_size
         if numbers.shape != (size,):
@@ -255,17 +249,15 @@ class Session:
         body: dict[str, Any] = {"request": self._request, "observation": numbers.tolist()}
         if hazards is not None:
             body["hazards"] = _numbers("hazards", hazards).tolist()
-        if stamp is not None:
-            body["stamp"] = float(_numbers("stamp", stamp))
+        if self._clock is not None:
+            body["stamp"] = float(_numbers("stamp", self._clock()))
         text, played = self._as_sealed()
         if text is not None:
             body["memory"] = text
-            self._lived = True
-        elif self._named is None and (self._robot is None or self._lived):
-            self._robot, self._lived = secrets.token_hex(8), False
         if played:
             body["played"] = played
-        body["robot"] = self._robot
+        if self._robot is not None:
+            body["robot"] = self._robot
         return to_json(body)
 
     def _as_sealed(self) -> tuple[str | None, int]:

@@ -17,7 +17,8 @@ from server.link import MAX_REPLY, Connected, Link, remaining
 
 _MAGIC = b"258EAFA5-E914-47DA-95CA-C5AB0DC85B11"
 """RFC 6455, section 1.3."""
-_TEXT, _CLOSE, _PING, _PONG = 0x1, 0x8, 0x9, 0xA
+_STATUS = b'{"status":'
+_TEXT, _PING, _PONG = 0x1, 0x9, 0xA
 _FINAL = 0x80
 _LONGEST_CONTROL = 125
 
@@ -45,7 +46,7 @@ class StreamLink(Link):
     def _transfer(
         self, opened: Connected, method: str, path: str, body: bytes, deadline: float
     ) -> tuple[int, bytes]:
-        """One frame each way: a reply that is none is an error's detail, and counts as refused."""
+        """One frame each way."""
         opened.deadline, opened.allowance = deadline, MAX_REPLY
         opened.settimeout(remaining(deadline))
         opened.sendall(_frame(_TEXT, body))
@@ -61,8 +62,11 @@ class StreamLink(Link):
 
 
 def _status_of(content: bytes) -> int:
-    """Refusals are told by their first field."""
-    return http.client.UNPROCESSABLE_ENTITY if content.startswith(b'{"detail"') else http.client.OK
+    """A frame that is no reply begins with its status."""
+    if not content.startswith(_STATUS):
+        return http.client.OK
+    digits = content[len(_STATUS) : len(_STATUS) + 3]
+    return int(digits) if digits.isdigit() else http.client.BAD_GATEWAY
 
 
 def _head(opened: Connected) -> tuple[int, dict[str, str]]:
