@@ -154,8 +154,14 @@ class Monitor:
 
         A bad input or any fault inside gives mode "fallback" with the reason.
         """
+        return self.decide_lost(observation, hazards, memory, None)
+
+    def decide_lost(
+        self, observation: ArrayLike, hazards: ArrayLike | None, memory: Any, lost: str | None
+    ) -> Decision:
+        """`decide` for a robot whose memory is ``lost``, and why: then nothing nominal is sent."""
         try:
-            past, lost = memory_of(1, memory), None
+            past = memory_of(1, memory)
         except ValueError as error:
             past, lost = np.zeros(1, MEMORY), self._bad(error)
         try:
@@ -191,7 +197,7 @@ class Monitor:
     def _decide_or_fall_back(
         self, observation: FloatArray, hazards: FloatArray | None, memory: Memory, lost: str | None = None
     ) -> Decisions:
-        """Decides; ``lost`` says that the memory was lost, and why: then nothing nominal is sent."""
+        """Decides, whatever happens; ``lost`` as in `decide_lost`."""
         try:
             return self._decide(observation, hazards, memory, lost)
         except Exception as error:  # noqa: BLE001 - whatever it is, the robot needs an action

@@ -9,7 +9,7 @@ from enum import IntEnum
 from functools import cached_property
 from typing import Any
 
-ACT, BATCH = "/act", "/act/batch"
+ACT, BATCH, STREAM = "/act", "/act/batch", "/act/stream"
 MODEL, HOLD, RESUME, ALARMS = "/model", "/hold", "/resume", "/alarms"
 OPEN_PATHS = frozenset({"/healthz", "/readyz"})
 """What an orchestrator may ask without a key."""
