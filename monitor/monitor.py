@@ -38,9 +38,6 @@ from monitor.gate import BoolArray, Gate, GateName
 from novelty import Findings, Normal, Watch, nothing
 from pointgoal.observation import layout
 
-_NOMINAL = Mode.NOMINAL.value
-"""numpy takes ten times as long to compare with the enumeration's member."""
-
 
 class ActionFilter(Protocol):
     """What the monitor needs of a filter; `filter.BarrierFilter` is one."""
@@ -249,7 +246,7 @@ class Monitor:
             decided = self._planned(
                 decided, [lost or self._wrong(*row) for row in zip(nominal, risk, sound, strict=True)]
             )
-        self.gate.remember(risk, engaging, decided.mode != _NOMINAL, decided.memory)
+        self.gate.remember(risk, engaging, decided.changed, decided.memory)
         if self._watch is not None:
             self._watch.remember(observation, found, decided.memory)
         return decided.told(nominal, risk, self.gate.threshold, opened_by, found.novelty, found.suspect)
