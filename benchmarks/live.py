@@ -9,11 +9,13 @@ service's. What is told last is what the hub adds to a decision while nobody wat
 
 from __future__ import annotations
 
+import secrets
 import socket
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from tempfile import NamedTemporaryFile
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -24,11 +26,12 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.recording import RecordingBenchmark, bodies, slower, times
-from benchmarks.server import Connection, cases
+from benchmarks.server import Connection, cases, full_memory
 from evaluation.service import Service
 from filter import FilterConfig
 from models import Bundle
 from monitor import Monitor
+from server.keeper import KEY_BYTES
 from server.live import Hub
 from server.observer import Answered
 from server.operation import Operation
@@ -67,10 +70,17 @@ def watched(url: str) -> Iterator[None]:
 
 def run(config: LiveBenchmark) -> dict[str, dict[str, FloatArray]]:
     """Case → "alone" and "watched" → time of each request [µs], (rounds, requests)."""
-    level = Bundle.load(config.bundle).manifest.level
+    bundle = Bundle.load(config.bundle)
+    level, key = bundle.manifest.level, secrets.token_bytes(KEY_BYTES)
     measured = {}
-    with Service.start(config.bundle, config.gate) as service:
-        for name, case in cases(level).items():
+    with ExitStack() as stack:
+        file = stack.enter_context(NamedTemporaryFile())
+        file.write(key)
+        file.flush()
+        service = stack.enter_context(
+            Service.start(config.bundle, config.gate, None, "--memory-key-file", file.name)
+        )
+        for name, case in cases(level, full_memory(bundle.id, key)).items():
             connection = Connection(f"{service.url}/act", *bodies(level, case.asked))
             connection.times(500)
             taken: dict[str, list[list[float]]] = {"alone": [], "watched": []}
@@ -90,7 +100,7 @@ def noted(config: LiveBenchmark, calls: int = 5000, rounds: int = 20) -> float:
     """What the hub adds to a decision while nobody watches [µs]."""
     monitor = Monitor.load(config.bundle, config.gate)
     hub = Hub(Views(monitor, FilterConfig()), Operation(monitor), {})
-    observation: list[float] = cases(monitor.bundle.manifest.level)["nominal"].asked["observation"]
+    observation: list[float] = cases(monitor.bundle.manifest.level, "")["nominal"].asked["observation"]
     asked = ActRequest(observation=observation, robot="ada")
     one: Any = Answered(0, ("h", 1), "/act", b"", 1e-3, 200, b"", [asked], [monitor.decide(observation)])
     taken = []

@@ -18,11 +18,11 @@ from decision.memory import (
     SENSED,
     Memory,
     copy_of,
-    memory_from_json,
     memory_of,
-    memory_to_json,
     next_of_plan,
+    pack,
     remember_sent,
+    unpack,
 )
 from decision.parts import in_parts
 from decision.stopwatch import Stopwatch
@@ -49,11 +49,11 @@ __all__ = [
     "fall_back",
     "hazards_of_one",
     "in_parts",
-    "memory_from_json",
     "memory_of",
-    "memory_to_json",
     "next_of_plan",
+    "pack",
     "remember_sent",
     "texts",
     "unknown",
+    "unpack",
 ]

@@ -38,9 +38,6 @@ from monitor.gate import BoolArray, Gate, GateName
 from novelty import Findings, Normal, Watch, nothing
 from pointgoal.observation import layout
 
-_NOMINAL = Mode.NOMINAL.value
-"""numpy takes ten times as long to compare with the enumeration's member."""
-
 
 class ActionFilter(Protocol):
     """What the monitor needs of a filter; `filter.BarrierFilter` is one."""
@@ -155,8 +152,14 @@ class Monitor:
 
         A bad input or any fault inside gives mode "fallback" with the reason.
         """
+        return self.decide_lost(observation, hazards, memory, None)
+
+    def decide_lost(
+        self, observation: ArrayLike, hazards: ArrayLike | None, memory: Any, lost: str | None
+    ) -> Decision:
+        """`decide` for a robot whose memory is ``lost``, and why: then nothing nominal is sent."""
         try:
-            past, lost = memory_of(1, memory), None
+            past = memory_of(1, memory)
         except ValueError as error:
             past, lost = np.zeros(1, MEMORY), self._bad(error)
         try:
@@ -192,7 +195,7 @@ class Monitor:
     def _decide_or_fall_back(
         self, observation: FloatArray, hazards: FloatArray | None, memory: Memory, lost: str | None = None
     ) -> Decisions:
-        """Decides; ``lost`` says that the memory was lost, and why: then nothing nominal is sent."""
+        """Decides, whatever happens; ``lost`` as in `decide_lost`."""
         try:
             return self._decide(observation, hazards, memory, lost)
         except Exception as error:  # noqa: BLE001 - whatever it is, the robot needs an action
@@ -244,7 +247,7 @@ class Monitor:
             decided = self._planned(
                 decided, [lost or self._wrong(*row) for row in zip(nominal, risk, sound, strict=True)]
             )
-        self.gate.remember(risk, engaging, decided.mode != _NOMINAL, decided.memory)
+        self.gate.remember(risk, engaging, decided.changed, decided.memory)
         if self._watch is not None:
             self._watch.remember(observation, found, decided.memory)
         return decided.told(nominal, risk, self.gate.threshold, opened_by, found.novelty, found.suspect)

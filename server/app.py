@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import secrets
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -17,6 +18,7 @@ from server.console import add_console
 from server.desk import Desk
 from server.freshness import Freshness
 from server.guard import Guard
+from server.keeper import KEY_BYTES, Keeper
 from server.keys import ACT, BATCH, Keys
 from server.live import Hub
 from server.observer import Observer, Recording
@@ -71,6 +73,7 @@ def create_app(
     changer: Changer | None = None,
     safety: Safety | None = None,
     freshness: Freshness | None = None,
+    memory_key: bytes | None = None,
     filter_config: FilterConfig | None = None,
 ) -> Guard:
     """The service around one monitor that is loaded and warmed up.
@@ -85,6 +88,7 @@ def create_app(
         changer: changes the bundle; None: nobody does.
         safety: the limits within which it decides.
         freshness: shared with whoever looks for silent robots; by default one within `safety.freshness`.
+        memory_key: seals the robots' memories, see `Keeper`; None: one made at random.
         filter_config: the filter's settings; None: the defaults.
     """
     state = lifecycle or Lifecycle()
@@ -141,8 +145,9 @@ def create_app(
     observers: list[Observer] = [watched.tally, hub]
     if recorder is not None:
         observers.append(Recording(recorder, model))
-    app.include_router(robots_router(known, _REFUSALS))
-    desk = Desk(app, duty, observers, limits, known)
+    keeper = Keeper(memory_key or secrets.token_bytes(KEY_BYTES), monitor.faults)
+    app.include_router(robots_router(known, keeper, _REFUSALS))
+    desk = Desk(app, duty, keeper, observers, limits, known)
     guard = Guard(desk, keys or Keys(), max_body, {BATCH: BATCH_BODY * max_body})
     add_console(app, watched, changer, guard.refusals)
     return guard
@@ -153,9 +158,6 @@ def _act_schema(model: ModelReply) -> dict[str, Any]:
     schema = ActRequest.model_json_schema()
     size = model.observation_size
     schema["properties"]["observation"] |= {"minItems": size, "maxItems": size}
-    # In place: a document has its definitions elsewhere, and a reply's memory is not quite a request's.
-    kinds = schema["properties"]["memory"]["anyOf"]
-    kinds[0] = schema.pop("$defs")[kinds[0]["$ref"].rpartition("/")[2]]
     return schema
 
 

@@ -10,14 +10,12 @@ from pathlib import Path
 
 from models import BundleError
 from monitor import Monitor, MonitorError
+from server.duty import SAME
 from server.operation import Operation
 from server.schema import ModelReply
 
 SWITCH_SECONDS = 1e-4
 """How long a thread keeps the interpreter from decisions while it loads a bundle [s]; usually 5 ms."""
-_SAME = ("observation_layout", "action_low", "action_high", "hazard_radius", "robot")
-"""What must not change: robots send the one, and their certified plans hang on the others."""
-
 Load = Callable[[Path], Monitor]
 """Loads a bundle with the service's settings, and warms it up."""
 
@@ -108,6 +106,6 @@ class Changer:
 
     def _check(self, new: ModelReply) -> None:
         old = self._operation.duty.now.model
-        for name in _SAME:
+        for name in SAME:
             if getattr(new, name) != getattr(old, name):
                 raise ChangeError(f"{new.model}: its {name} is not that of {old.model}")

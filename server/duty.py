@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import hashlib
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from decision import BatchDecider, Decision, Decisions, Memory, memory_of
+from decision import Decision, Decisions, Memory, memory_of
 from monitor import Monitor
 from server.schema import ModelReply
 
 UNDECIDED = "not decided: "
 """What the reason begins with where the monitor was not asked, or did not answer in time."""
+SAME = ("observation_layout", "action_low", "action_high", "hazard_radius", "robot")
+"""What must not change when another bundle takes over: robots send the one, and their certified plans, which
+their memories hold, hang on the others."""
 HELD = "hold"
 """How the reasons of held decisions go on."""
 
@@ -23,8 +27,17 @@ class OnDuty(NamedTuple):
     monitor: Monitor
     model: ModelReply
     """What it tells of itself."""
-    decider: BatchDecider
+    decider: Monitor | Held
     """The monitor, or who sends the safe action in its place."""
+    robot: str
+    """A hash of `SAME`."""
+
+    @classmethod
+    def of(cls, monitor: Monitor, model: ModelReply | None = None) -> Self:
+        """A monitor that decides, and what it tells of itself, if that is known already."""
+        told = model or ModelReply.of(monitor)
+        same = told.model_dump_json(include=set(SAME))
+        return cls(monitor, told, monitor, hashlib.sha256(same.encode()).hexdigest())
 
 
 class Held:
@@ -44,6 +57,12 @@ class Held:
     ) -> Decision:
         """The safe decision for one robot, whatever it sees."""
         return self._hold(memory_of(1, memory))[0]
+
+    def decide_lost(
+        self, observation: ArrayLike, hazards: ArrayLike | None, memory: Any, lost: str | None
+    ) -> Decision:
+        """The safe decision for a robot whose memory is ``lost``, or None if it is not."""
+        return self.decide(observation, hazards, memory)
 
     def decide_batch(
         self, observation: ArrayLike, hazards: ArrayLike | None = None, memory: Memory | None = None
@@ -67,12 +86,12 @@ class Duty:
     """
 
     def __init__(self, monitor: Monitor, model: ModelReply | None = None) -> None:
-        self.now = OnDuty(monitor, model or ModelReply.of(monitor), monitor)
+        self.now = OnDuty.of(monitor, model)
 
     def take_over(self, monitor: Monitor, why_held: str | None) -> None:
         """Another monitor decides from now on, unless every decision is held; its faults are counted on."""
         monitor.faults = self.now.monitor.faults
-        self.now = OnDuty(monitor, ModelReply.of(monitor), monitor)
+        self.now = OnDuty.of(monitor)
         self.hold(why_held)
 
     def hold(self, why: str | None) -> None:

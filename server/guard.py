@@ -11,7 +11,7 @@ from typing import Any
 from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from server.keys import ACT, BATCH, HOLD, MODEL, RESUME, Keys, Level, needed
+from server.keys import ACT, BATCH, HOLD, MODEL, RESUME, STREAM, Keys, Level, needed
 
 ADMIN_PATHS = frozenset({MODEL, HOLD, RESUME})
 """Whoever posts there needs the admin key. Where there is none it is refused: any page in a browser could."""
@@ -22,6 +22,8 @@ FULL = "lagnet.full"
 RETRY_AFTER = (b"retry-after", b"1")
 """Says when whoever found the service overloaded may try again [s]."""
 
+_HANDSHAKE = "websocket.http.response"
+"""What messages are called that answer a WebSocket's handshake with a reply."""
 _MAX_DIGITS = 18
 
 
@@ -53,10 +55,10 @@ class Guard:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Handles one connection."""
-        if scope["type"] != "http":
-            await self._app(scope, receive, send)
-            return
         headers: dict[bytes, bytes] = dict(scope["headers"])
+        if scope["type"] == "websocket":
+            await self._stream(headers, scope, receive, send)
+            return
         wanted = needed(scope)
         if wanted and (granted := self._keys.granted(headers)) < wanted:
             status, message = _not_allowed(granted, wanted)
@@ -80,13 +82,33 @@ class Guard:
         with suppress(ClientDisconnect):
             await self._app(scope, receive, send)
 
+    async def _stream(
+        self, headers: Mapping[bytes, bytes], scope: Scope, receive: Receive, send: Send
+    ) -> None:
+        if scope["path"] != STREAM:
+            message = f"the stream is at {STREAM}"
+            await self._refuse(send, 404, "path", scope["path"], message, _HANDSHAKE)
+        elif (granted := self._keys.granted(headers)) < Level.ACT:
+            status, message = _not_allowed(granted, Level.ACT)
+            await self._refuse(send, status, "header", "authorization", message, _HANDSHAKE)
+        elif b"origin" in headers:
+            # Browsers let any page open a stream to any host, and say whose page it is.
+            message = "the stream is not for browsers"
+            await self._refuse(send, 403, "header", "origin", message, _HANDSHAKE)
+        else:
+            await self._app(scope, receive, send)
+
     def is_robots(self, scope: Mapping[str, Any]) -> bool:
         """Whether a request is one that only a robot makes: for a decision, with the key."""
-        return scope["path"] in (ACT, BATCH) and self._keys.granted(dict(scope["headers"])) >= Level.ACT
+        if scope["path"] not in (ACT, BATCH, STREAM):
+            return False
+        return self._keys.granted(dict(scope["headers"])) >= Level.ACT
 
-    async def _refuse(self, send: Send, status: int, place: str, name: str, message: str) -> None:
+    async def _refuse(
+        self, send: Send, status: int, place: str, name: str, message: str, kind: str = "http.response"
+    ) -> None:
         self.refusals[status] += 1
-        await _refuse(send, status, place, name, message)
+        await _refuse(send, status, place, name, message, kind)
 
 
 def _not_allowed(granted: Level, wanted: Level) -> tuple[int, str]:
@@ -115,7 +137,9 @@ def _limited(receive: Receive, max_body: int) -> Receive:
     return limited
 
 
-async def _refuse(send: Send, status: int, place: str, name: str, message: str) -> None:
+async def _refuse(
+    send: Send, status: int, place: str, name: str, message: str, kind: str = "http.response"
+) -> None:
     """Answers a request that is not read, and closes its connection."""
     detail = [{"loc": [place, name], "msg": message, "type": "refused"}]
     body = json.dumps({"detail": detail}).encode()
@@ -126,5 +150,5 @@ async def _refuse(send: Send, status: int, place: str, name: str, message: str) 
         headers.append(RETRY_AFTER)
     # The body was not read: the connection cannot carry another request.
     headers.append((b"connection", b"close"))
-    await send({"type": "http.response.start", "status": status, "headers": headers})
-    await send({"type": "http.response.body", "body": body})
+    await send({"type": f"{kind}.start", "status": status, "headers": headers})
+    await send({"type": f"{kind}.body", "body": body})

@@ -9,7 +9,7 @@ from enum import IntEnum
 from functools import cached_property
 from typing import Any
 
-ACT, BATCH = "/act", "/act/batch"
+ACT, BATCH, STREAM = "/act", "/act/batch", "/act/stream"
 MODEL, HOLD, RESUME, ALARMS = "/model", "/hold", "/resume", "/alarms"
 HOME, PAGE = "/", "/page/"
 """The live page, and what its files' paths begin with: they hold no secret."""

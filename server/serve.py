@@ -35,10 +35,12 @@ from server.door import Connection, Door, Patience
 from server.events import Events, Form
 from server.freshness import Freshness, Limits
 from server.guard import Guard
+from server.keeper import KEY_BYTES
 from server.keys import Keys
 from server.operation import Operation
 from server.safety import Safety
 from server.schema import ModelReply
+from server.streaming import StreamConnection
 
 KEY_VARIABLE = "LAGNET_API_KEY"
 """Environment variable that may hold the key to ask for decisions."""
@@ -90,6 +92,9 @@ class ServeConfig:
     """How old observations are and how late actions take effect, together, in control steps."""
     api_key_file: Path | None = None
     """File that holds the key to ask for decisions; otherwise the environment variable LAGNET_API_KEY."""
+    memory_key_file: Path | None = None
+    """File with at least 32 bytes by which robots' memories are sealed: services that share it take each
+    other's, and a restart loses none. By default a key made at random."""
     read_key_file: Path | None = None
     """File that holds the key to read alone; otherwise the environment variable LAGNET_READ_KEY."""
     admin_key_file: Path | None = None
@@ -400,6 +405,23 @@ def read_keys(config: ServeConfig) -> Keys:
         raise ServeError(str(error)) from error
 
 
+def read_memory_key(path: Path | None) -> bytes | None:
+    """The key that seals memories, if a file holds one.
+
+    Raises:
+        ServeError: if the file cannot be read, or has too few bytes.
+    """
+    if path is None:
+        return None
+    try:
+        key = path.read_bytes()
+    except OSError as error:
+        raise ServeError(f"--memory-key-file {path}: cannot be read: {error.strerror}") from error
+    if len(key) < KEY_BYTES:
+        raise ServeError(f"--memory-key-file {path} must hold at least {KEY_BYTES} bytes, has {len(key)}")
+    return key
+
+
 def allow_files(connections: int) -> None:
     """Allows this process as many open files as so many robots and newcomers take.
 
@@ -432,6 +454,7 @@ def serve(config: ServeConfig) -> None:
     """
     config.check()
     keys = read_keys(config)
+    memory_key = read_memory_key(config.memory_key_file)
     rules = read_rules(config.alarms)
     allow_files(config.max_connections)
     listener = listen(config.host, config.port, keys)
@@ -459,11 +482,12 @@ def serve(config: ServeConfig) -> None:
                 keys,
                 config.max_body,
                 recorder,
-                operation,
-                changer,
-                safety,
-                freshness,
-                config.filter_config(),
+                operation=operation,
+                changer=changer,
+                safety=safety,
+                freshness=freshness,
+                memory_key=memory_key,
+                filter_config=config.filter_config(),
             )
             # What is loaded stays: looking through it again and again for garbage would hold up decisions.
             gc.collect()
@@ -501,7 +525,10 @@ def _server(
         log_config=None,  # `Events` tells what it logs
         log_level="error",  # warnings are of what anybody may send, a line each
         lifespan="off",
-        ws="none",
+        ws=StreamConnection,
+        ws_max_size=config.max_body,
+        ws_ping_interval=None,  # whoever is silent has a deadline
+        ws_per_message_deflate=False,  # it would take longer than the decision
         server_header=False,
         http=Connection,
         timeout_keep_alive=math.ceil(config.idle_seconds),

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from decision import MEMORY, Decision, memory_from_json
+from decision import MEMORY, Decision
 from filter import FilterConfig, FilterError
 from monitor import Monitor
 from pointgoal.observation import LIDAR_BINS, ObservationLayout, layout
@@ -70,10 +70,10 @@ class Views:
         """
         observation = np.array(asked.observation)
         given = np.array(asked.hazards or [], np.float64).reshape(-1, 2)
+        # What was under way when it asked: all that it was sent but this action.
         memory = np.zeros(1, MEMORY)
+        memory["history"]["sent"][0, :-1] = decision.memory["history"]["sent"][1:]
         try:
-            if asked.memory is not None:
-                memory = memory_from_json(asked.memory.model_dump())
             scene = self._monitor.look(observation[None], given[None], memory)
         except (FilterError, ValueError) as error:
             return {"problem": str(error)}
