@@ -37,6 +37,7 @@ from monitor import GateName, Monitor
 from pointgoal.lidar import encode
 from pointgoal.observation import layout
 from server.keeper import KEY_BYTES, Keeper, Past
+from server.keys import Keys
 from server.serve import listen
 
 
@@ -232,7 +233,7 @@ def serve_echo() -> None:
     async def echo(body: Echo) -> Echo:
         return body
 
-    listener = listen("127.0.0.1", 0, None)
+    listener = listen("127.0.0.1", 0, Keys())
     print(json.dumps({"url": f"http://127.0.0.1:{listener.getsockname()[1]}"}), flush=True)
     uvicorn.Server(uvicorn.Config(app, access_log=False, log_level="warning", ws="none")).run(
         sockets=[listener]

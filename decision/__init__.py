@@ -24,6 +24,8 @@ from decision.memory import (
     remember_sent,
     unpack,
 )
+from decision.parts import in_parts
+from decision.stopwatch import Stopwatch
 
 __all__ = [
     "HISTORY",
@@ -42,9 +44,11 @@ __all__ = [
     "Mode",
     "OpenedBy",
     "Origin",
+    "Stopwatch",
     "copy_of",
     "fall_back",
     "hazards_of_one",
+    "in_parts",
     "memory_of",
     "next_of_plan",
     "pack",

@@ -1,4 +1,4 @@
-"""The HTTP service: `POST /act`, `POST /act/batch`, `/model`, `/healthz`, `/readyz`."""
+"""The HTTP service: decisions, what tells of itself, health checks, and what an operator asks and says."""
 
 from __future__ import annotations
 
@@ -11,23 +11,37 @@ from fastapi.responses import JSONResponse
 
 from monitor import Monitor
 from recorder import Recorder
+from server.change import Changer
+from server.console import add_console
 from server.desk import Desk
-from server.guard import ACT, BATCH, Guard
+from server.freshness import Freshness
+from server.guard import Guard
 from server.keeper import KEY_BYTES, Keeper
+from server.keys import ACT, BATCH, Keys
 from server.observer import Observer, Recording
+from server.operation import Operation
+from server.robots import RESET, robots_router
+from server.safety import Safety
 from server.schema import MAX_ROBOTS, ActReply, ActRequest, BatchReply, ModelReply
+from server.states import NOT_READY, State
 
 MAX_BODY = 65536
 """Most bytes of a request's body: 60 numbers and a thousand hazards fit."""
-MANY_FAULTS = 5
-"""Internal faults within a minute from which on the service is not ready: a robot may live with one."""
 BATCH_BODY = 16
 """The body of a batch may be so many times as large."""
 
-_ERRORS: dict[int | str, dict[str, Any]] = {
+_REFUSALS: dict[int | str, dict[str, Any]] = {
+    401: {"description": "no valid key"},
+    403: {"description": "a key for less than this"},
     413: {"description": "body too large"},
+}
+_ACT_LINKS: dict[int | str, dict[str, Any]] = {
+    200: {"links": {"reset": {"operationId": RESET, "parameters": {"name": "$request.body#/robot"}}}}
+}
+_ERRORS: dict[int | str, dict[str, Any]] = _REFUSALS | {
     422: {"description": "names the field that is wrong"},
     500: {"description": "the decision could not be told"},
+    503: {"description": "overloaded; Retry-After says when to try again"},
 }
 
 
@@ -45,9 +59,13 @@ class Lifecycle:
 def create_app(
     monitor: Monitor,
     lifecycle: Lifecycle | None = None,
-    api_key: str | None = None,
+    keys: Keys | None = None,
     max_body: int = MAX_BODY,
     recorder: Recorder | None = None,
+    operation: Operation | None = None,
+    changer: Changer | None = None,
+    safety: Safety | None = None,
+    freshness: Freshness | None = None,
     memory_key: bytes | None = None,
 ) -> Guard:
     """The service around one monitor that is loaded and warmed up.
@@ -55,13 +73,21 @@ def create_app(
     Args:
         monitor: what decides.
         lifecycle: shared with whoever stops the service.
-        api_key: the key that every request but the health checks must carry; None asks for none.
+        keys: those that every request but the health checks must carry one of; None asks for none.
         max_body: most bytes of a request's body; a batch's may be `BATCH_BODY` times as large.
         recorder: what records the decisions, if any does.
+        operation: what an operator sees and says; by default one with the usual alarms.
+        changer: changes the bundle; None: nobody does.
+        safety: the limits within which it decides.
+        freshness: shared with whoever looks for silent robots; by default one within `safety.freshness`.
         memory_key: seals the robots' memories, see `Keeper`; None: one made at random.
     """
     state = lifecycle or Lifecycle()
-    model = ModelReply.of(monitor)
+    limits = safety or Safety()
+    known = freshness or Freshness(limits.freshness, monitor.faults.note)
+    watched = operation or Operation(monitor, recorder)
+    duty = watched.duty
+    model = duty.now.model
     # No /docs: its page loads scripts from other hosts. /openapi.json is there.
     app = FastAPI(
         title="Lagnet", description="What a watched robot policy does next.", docs_url=None, redoc_url=None
@@ -69,7 +95,12 @@ def create_app(
 
     # These two document their paths; `Desk` answers them before FastAPI is asked, at a third of the cost, and
     # with errors that name the field without repeating the input, which may be NaN.
-    @app.post(ACT, response_model=ActReply, responses=_ERRORS, openapi_extra=_body_of(_act_schema(model)))
+    @app.post(
+        ACT,
+        response_model=ActReply,
+        responses=_ERRORS | _ACT_LINKS,
+        openapi_extra=_body_of(_act_schema(model)),
+    )
     async def act() -> None:
         raise NotImplementedError
 
@@ -81,27 +112,31 @@ def create_app(
 
     @app.get("/model", response_model=ModelReply)
     async def about() -> ModelReply:
-        return model
+        return duty.now.model
 
     @app.get("/healthz")
     async def healthz() -> dict[str, Any]:
         # A service that can no longer record is alive, and says so.
-        return {"status": "alive"} | ({} if recorder is None else {"recording": recorder.status()})
+        told = {"status": "alive", "state": watched.states.state}
+        return told | ({} if recorder is None else {"recording": recorder.status()})
 
-    @app.get("/readyz", responses={503: {"description": "draining, or degraded by its own faults"}})
+    @app.get("/readyz", responses={503: {"description": "starting, degraded, draining or stopped"}})
     async def readyz() -> JSONResponse:
         if state.draining:
-            return JSONResponse({"status": "draining"}, status_code=503)
-        faults = monitor.faults.internal()
-        if faults >= MANY_FAULTS:
-            return JSONResponse({"status": "degraded", "internal_faults": faults}, status_code=503)
-        return JSONResponse({"status": "ready"})
+            watched.drain()
+        status = watched.tick()
+        told = {"why": watched.states.why} if status in (State.DEGRADED, State.HOLD) else {}
+        return JSONResponse({"status": status} | told, 503 if status in NOT_READY else 200)
 
-    observers: list[Observer] = [] if recorder is None else [Recording(recorder)]
+    observers: list[Observer] = [watched.tally]
+    if recorder is not None:
+        observers.append(Recording(recorder, model))
     keeper = Keeper(memory_key or secrets.token_bytes(KEY_BYTES), monitor.faults)
-    return Guard(
-        Desk(app, monitor, model, keeper, observers), api_key, max_body, {BATCH: BATCH_BODY * max_body}
-    )
+    app.include_router(robots_router(known, keeper, _REFUSALS))
+    desk = Desk(app, duty, keeper, observers, limits, known)
+    guard = Guard(desk, keys or Keys(), max_body, {BATCH: BATCH_BODY * max_body})
+    add_console(app, watched, changer, guard.refusals)
+    return guard
 
 
 def _act_schema(model: ModelReply) -> dict[str, Any]:

@@ -1,9 +1,9 @@
-"""What stands before every request, as pure ASGI: the key, a place, and the limit on the body's size."""
+"""What stands before every request, as pure ASGI: the keys, a place, and the limit on the body's size."""
 
 from __future__ import annotations
 
-import hmac
 import json
+from collections import Counter
 from collections.abc import Mapping
 from contextlib import suppress
 from typing import Any
@@ -11,13 +11,16 @@ from typing import Any
 from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-ACT, BATCH, STREAM = "/act", "/act/batch", "/act/stream"
-OPEN_PATHS = frozenset({"/healthz", "/readyz"})
-"""What an orchestrator may ask without a key."""
+from server.keys import ACT, BATCH, HOLD, MODEL, RESUME, STREAM, Keys, Level, needed
+
+ADMIN_PATHS = frozenset({MODEL, HOLD, RESUME})
+"""Whoever posts there needs the admin key. Where there is none it is refused: any page in a browser could."""
 AT_ONCE = "lagnet.at_once"
 """The ASGI extension by which the server takes status and body of a JSON reply at once: True if it did."""
 FULL = "lagnet.full"
 """The ASGI extension that says whether there is no place for one more robot."""
+RETRY_AFTER = (b"retry-after", b"1")
+"""Says when whoever found the service overloaded may try again [s]."""
 
 _HANDSHAKE = "websocket.http.response"
 """What messages are called that answer a WebSocket's handshake with a reply."""
@@ -29,20 +32,24 @@ class BodyTooLargeError(ValueError):
 
 
 class Guard:
-    """Refuses requests without the key (401), without a place (503) and with a body above the limit (413).
+    """Refuses requests without a key (401), with one for less (403), without a place (503), too large (413).
 
     Args:
         app: what it guards.
-        api_key: the key that `Authorization: Bearer KEY` or `X-API-Key: KEY` must carry; None asks for none.
+        keys: those that `Authorization: Bearer KEY` or `X-API-Key: KEY` may carry.
         max_body: most bytes of a request's body.
         larger: path → most bytes of a body there, where that is more.
+
+    Attributes:
+        refusals: status → requests refused here.
     """
 
     def __init__(
-        self, app: ASGIApp, api_key: str | None, max_body: int, larger: Mapping[str, int] | None = None
+        self, app: ASGIApp, keys: Keys, max_body: int, larger: Mapping[str, int] | None = None
     ) -> None:
+        self.refusals: Counter[int] = Counter()
         self._app = app
-        self._key = None if api_key is None else api_key.encode()
+        self._keys = keys
         self._max_body = max_body
         self._larger = larger or {}
 
@@ -52,17 +59,22 @@ class Guard:
         if scope["type"] == "websocket":
             await self._stream(headers, scope, receive, send)
             return
-        if scope["path"] not in OPEN_PATHS and not self._admits(headers):
-            await _refuse(send, 401, "header", "authorization", "a valid API key is required")
+        wanted = needed(scope)
+        if wanted and (granted := self._keys.granted(headers)) < wanted:
+            status, message = _not_allowed(granted, wanted)
+            await self._refuse(send, status, "header", "authorization", message)
+            return
+        if scope["path"] in ADMIN_PATHS and scope["method"] == "POST" and self._keys.admin is None:
+            await self._refuse(send, 403, "header", "authorization", "the service has no admin key")
             return
         if scope["path"] in (ACT, BATCH) and scope.get("extensions", {}).get(FULL):
-            await _refuse(send, 503, "connection", "limit", "every connection awaits its answer")
+            await self._refuse(send, 503, "connection", "limit", "every connection awaits its answer")
             return
         max_body = self._larger.get(scope["path"], self._max_body)
         stated = headers.get(b"content-length", b"")
         # int() refuses thousands of digits.
         if stated.isdigit() and (len(stated) > _MAX_DIGITS or int(stated) > max_body):
-            await _refuse(send, 413, "body", "content-length", _too_large(max_body))
+            await self._refuse(send, 413, "body", "content-length", _too_large(max_body))
             return
         if not stated.isdigit() or b"transfer-encoding" in headers:
             receive = _limited(receive, max_body)
@@ -74,21 +86,35 @@ class Guard:
         self, headers: Mapping[bytes, bytes], scope: Scope, receive: Receive, send: Send
     ) -> None:
         if scope["path"] != STREAM:
-            await _refuse(send, 404, "path", scope["path"], f"the stream is at {STREAM}", _HANDSHAKE)
-        elif not self._admits(headers):
-            await _refuse(send, 401, "header", "authorization", "a valid API key is required", _HANDSHAKE)
+            message = f"the stream is at {STREAM}"
+            await self._refuse(send, 404, "path", scope["path"], message, _HANDSHAKE)
+        elif (granted := self._keys.granted(headers)) < Level.ACT:
+            status, message = _not_allowed(granted, Level.ACT)
+            await self._refuse(send, status, "header", "authorization", message, _HANDSHAKE)
         elif b"origin" in headers:
             # Browsers let any page open a stream to any host, and say whose page it is.
-            await _refuse(send, 403, "header", "origin", "the stream is not for browsers", _HANDSHAKE)
+            message = "the stream is not for browsers"
+            await self._refuse(send, 403, "header", "origin", message, _HANDSHAKE)
         else:
             await self._app(scope, receive, send)
 
     def is_robots(self, scope: Mapping[str, Any]) -> bool:
         """Whether a request is one that only a robot makes: for a decision, with the key."""
-        return scope["path"] in (ACT, BATCH, STREAM) and self._admits(dict(scope["headers"]))
+        if scope["path"] not in (ACT, BATCH, STREAM):
+            return False
+        return self._keys.granted(dict(scope["headers"])) >= Level.ACT
 
-    def _admits(self, headers: Mapping[bytes, bytes]) -> bool:
-        return self._key is None or _carries(headers, self._key)
+    async def _refuse(
+        self, send: Send, status: int, place: str, name: str, message: str, kind: str = "http.response"
+    ) -> None:
+        self.refusals[status] += 1
+        await _refuse(send, status, place, name, message, kind)
+
+
+def _not_allowed(granted: Level, wanted: Level) -> tuple[int, str]:
+    if granted == Level.NOTHING:
+        return 401, "a valid API key is required"
+    return 403, f"this takes the {wanted.name.lower()} key, not the {granted.name.lower()} key"
 
 
 def _too_large(max_body: int) -> str:
@@ -111,12 +137,6 @@ def _limited(receive: Receive, max_body: int) -> Receive:
     return limited
 
 
-def _carries(headers: Mapping[bytes, bytes], key: bytes) -> bool:
-    scheme, _, bearer = headers.get(b"authorization", b"").partition(b" ")
-    given = bearer.strip() if scheme.lower() == b"bearer" else headers.get(b"x-api-key", b"")
-    return hmac.compare_digest(given, key)
-
-
 async def _refuse(
     send: Send, status: int, place: str, name: str, message: str, kind: str = "http.response"
 ) -> None:
@@ -127,7 +147,7 @@ async def _refuse(
     if status == 401:
         headers.append((b"www-authenticate", b"Bearer"))
     if status == 503:
-        headers.append((b"retry-after", b"1"))
+        headers.append(RETRY_AFTER)
     # The body was not read: the connection cannot carry another request.
     headers.append((b"connection", b"close"))
     await send({"type": f"{kind}.start", "status": status, "headers": headers})

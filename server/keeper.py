@@ -62,14 +62,14 @@ class Keeper:
         self._last: dict[Who, bytes] = {}
         self._lock = Lock()
 
-    def past(self, text: str | None, played: int, robot: str | None, bundle: str) -> Past:
+    def past(self, text: str | None, played: int, robot: str | None, kind: str) -> Past:
         """What to go by for a robot that brings a memory, or none.
 
         Args:
             text: the memory as it came.
             played: for how many control steps the robot says that it has gone on by itself since.
             robot: the robot's name, if it told one.
-            bundle: the bundle's id.
+            kind: what kind of robot it is, see `OnDuty.robot`: another kind's plans are not its own.
         """
         last = None if robot is None else self._last.get(robot)
         if text is None:
@@ -79,7 +79,7 @@ class Keeper:
         except ValueError as error:
             return self._lost(str(error), last)
         data = memory.tobytes()
-        if not hmac.compare_digest(data[_TAG:], self._tag(data[:_TAG], bundle, robot)):
+        if not hmac.compare_digest(data[_TAG:], self._tag(data[:_TAG], kind, robot)):
             return self._lost("the memory is not one that this service sent", last)
         if robot is None:
             last = self._last.get(_word(data, _FIRST))
@@ -89,20 +89,20 @@ class Keeper:
             return Past(_apart(last), None, last)
         return Past(_gone_on(memory, played) if played else memory, None, last)
 
-    def seal(self, memory: np.void, robot: str | None, bundle: str, past: Past) -> str:
+    def seal(self, memory: np.void, robot: str | None, kind: str, past: Past) -> str:
         """A memory as it leaves, and is remembered.
 
         Args:
             memory: of the decision.
             robot: the robot's name, if it told one.
-            bundle: the bundle's id.
+            kind: what kind of robot it is, see `OnDuty.robot`: another kind's plans are not its own.
             past: what the decision went by.
         """
         before, first = (0, 0) if past.memory is None else past.memory["seal"][0, :2].tolist()
         number = max(time.time_ns(), before + 1, 0 if past.last is None else _word(past.last, _NUMBER) + 1)
         who: Who = robot or first or number
         data = memory.tobytes()[:_NUMBER] + struct.pack("<qq", number, 0 if robot else who)
-        data += self._tag(data, bundle, robot)
+        data += self._tag(data, kind, robot)
         if who != number:  # whoever never brings a memory is nobody to remember
             self._remember(who, data, past.last)
         return pack(data)
@@ -112,9 +112,9 @@ class Keeper:
         with self._lock:
             return self._last.pop(robot, None) is not None
 
-    def _tag(self, data: bytes, bundle: str, robot: str | None) -> bytes:
+    def _tag(self, data: bytes, kind: str, robot: str | None) -> bytes:
         whose = "" if robot is None else robot
-        return blake2b(data + f"{bundle}\0{whose}".encode(), key=self._key, digest_size=16).digest()
+        return blake2b(data + f"{kind}\0{whose}".encode(), key=self._key, digest_size=16).digest()
 
     def _without(self, last: bytes, robot: str | None) -> Past:
         """A robot that is known comes without its memory: it starts anew, unless a sensor was caught."""
@@ -169,11 +169,11 @@ class AsItComes(Keeper):
     def __init__(self) -> None:
         super().__init__(b"", Faults())
 
-    def past(self, text: str | None, played: int, robot: str | None, bundle: str) -> Past:
+    def past(self, text: str | None, played: int, robot: str | None, kind: str) -> Past:
         """The memory as it came."""
         memory = None if text is None else unpack(text)
         return Past(_gone_on(memory, played) if memory is not None and played else memory, None, None)
 
-    def seal(self, memory: np.void, robot: str | None, bundle: str, past: Past) -> str:
+    def seal(self, memory: np.void, robot: str | None, kind: str, past: Past) -> str:
         """A memory without number and tag."""
         return pack(memory.tobytes()[:_NUMBER] + bytes(MEMORY.itemsize - _NUMBER))

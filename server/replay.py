@@ -23,6 +23,7 @@ from recorder import RecordingError
 from recorder.reading import Reader, Recorded
 from recorder.timeline import Row, Timeline
 from server.desk import Desk
+from server.duty import UNDECIDED, Duty
 from server.keeper import AsItComes
 from server.schema import ModelReply
 
@@ -67,11 +68,13 @@ class Comparison:
     Attributes:
         count: how many.
         differing: how many of them differ.
+        undecided: how many more were the service's own: too late, or too old.
         shown: the first that do: what is to be said of each.
     """
 
     count: int = 0
     differing: int = 0
+    undecided: int = 0
     shown: list[str] = field(default_factory=list)
 
 
@@ -101,7 +104,7 @@ class Again:
             raise RecordingError(f"the recording is of another version of lagnet-serve: {error}") from error
         monitor = Monitor.load(bundle, gate, threshold, filter_config, guide)
         now = ModelReply.of(monitor)
-        self._desk = Desk(_nobody, monitor, now, AsItComes())
+        self._desk = Desk(_nobody, Duty(monitor, now), AsItComes())
         self.comparison = Comparison()
         self.other = None
         if now.sha256 != files:
@@ -124,6 +127,9 @@ class Again:
             if robot not in wanted:
                 continue
             one, two = (told[place] if place < len(told) else {} for told in (then, now))
+            if (one.get("reason") or "").startswith(UNDECIDED):
+                self.comparison.undecided += 1
+                continue
             self.comparison.count += 1
             if differences := _differences(one, two):
                 self.comparison.differing += 1
@@ -249,6 +255,10 @@ def _told_again(again: Again, console: Console) -> bool:
     found = again.comparison
     if again.other is not None:
         console.print(again.other, style="yellow")
+    if found.undecided:
+        console.print(
+            f"{found.undecided} fallbacks are the service's own (deadline, freshness) and are not compared"
+        )
     if not found.differing:
         console.print(f"{found.count} of {found.count} decisions equal bit for bit", style="green")
         return True

@@ -8,11 +8,14 @@ import ipaddress
 import json
 import math
 import os
+import signal
 import socket
+import ssl
 import sys
 import time
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Annotated
@@ -25,15 +28,26 @@ from filter import FilterConfig
 from models import BundleError
 from monitor import DEFAULT_STRENGTH, GateName, Monitor, MonitorError, Strength
 from recorder import Recorder, RecordingError, Settings
+from server.alarms import AlarmsError, read_rules
 from server.app import MAX_BODY, Lifecycle, create_app
+from server.change import ChangeError, Changer
 from server.door import Connection, Door, Patience
+from server.events import Events, Form
+from server.freshness import Freshness, Limits
 from server.guard import Guard
 from server.keeper import KEY_BYTES
+from server.keys import Keys
+from server.operation import Operation
+from server.safety import Safety
 from server.schema import ModelReply
 from server.streaming import StreamConnection
 
 KEY_VARIABLE = "LAGNET_API_KEY"
-"""Environment variable that may hold the key."""
+"""Environment variable that may hold the key to ask for decisions."""
+READ_KEY_VARIABLE = "LAGNET_READ_KEY"
+"""Environment variable that may hold the key to read."""
+ADMIN_KEY_VARIABLE = "LAGNET_ADMIN_KEY"
+"""Environment variable that may hold the key to change things."""
 _OTHER_FILES = 64
 """Files that are open beside the connections."""
 LEAST_FILE = 4.0
@@ -77,10 +91,32 @@ class ServeConfig:
     delay_steps: int = 0
     """How old observations are and how late actions take effect, together, in control steps."""
     api_key_file: Path | None = None
-    """File that holds the key; otherwise the environment variable LAGNET_API_KEY."""
+    """File that holds the key to ask for decisions; otherwise the environment variable LAGNET_API_KEY."""
     memory_key_file: Path | None = None
     """File with at least 32 bytes by which robots' memories are sealed: services that share it take each
     other's, and a restart loses none. By default a key made at random."""
+    read_key_file: Path | None = None
+    """File that holds the key to read alone; otherwise the environment variable LAGNET_READ_KEY."""
+    admin_key_file: Path | None = None
+    """File that holds the key to change things; otherwise the environment variable LAGNET_ADMIN_KEY."""
+    tls_cert: Path | None = None
+    """File with the certificate (PEM, with those above it): then it speaks HTTPS."""
+    tls_key: Path | None = None
+    """File with the certificate's key (PEM, no passphrase)."""
+    deadline_ms: float | None = None
+    """How long a decision may take [ms]; then the fallback is sent. Decisions then take about 0.05 ms longer.
+    By default each takes as long as it takes."""
+    max_age_ms: float | None = None
+    """How old an observation may be, by its stamp [ms]; then, and where it has no stamp or no robot's name,
+    the fallback is sent. By default only the clocks of those that are stamped are checked."""
+    hold_after_ms: float = 1e3 * Limits.hold_after
+    """For how long a robot may be without a fresh observation [ms]; then it is held until it is reset."""
+    silent_after_ms: float = 1e3 * Limits.silent_after
+    """After what time without a request a robot counts as silent [ms]."""
+    max_in_flight: int = Safety.max_in_flight
+    """Most requests of one client address that await their decisions; more are answered 503."""
+    max_in_flight_all: int = Safety.max_in_flight_all
+    """Most requests of all clients together that await their decisions."""
     max_body: int = MAX_BODY
     """Most bytes of a request's body; more is refused with 413."""
     max_connections: int = 512
@@ -102,6 +138,13 @@ class ServeConfig:
     """Folder for the last 30 s before every fallback or alarm; by default that of --record."""
     incidents_mb: float = 256.0
     """Size of all files of incidents in it [MB]; where they come to more, the oldest go."""
+    alarms: Path | None = None
+    """TOML file with settings of alarms that are to be other than usual."""
+    log: Form = "text"
+    """How events are told on standard error: warnings and errors as text, or all of them as JSON, a line
+    each."""
+    bundles: Path | None = None
+    """Folder with other bundles, which POST /model may change to. SIGHUP loads the service's own anew."""
 
     def filter_config(self) -> FilterConfig:
         """The filter's settings, or ServeError for one that is out of its range."""
@@ -124,7 +167,54 @@ class ServeConfig:
                 raise ServeError(f"{flag} must be finite and above 0, got {seconds}")
         if not (math.isfinite(self.drain_seconds) and self.drain_seconds >= 0.0):
             raise ServeError(f"--drain-seconds must be finite and at least 0, got {self.drain_seconds}")
+        self.safety()
+        self._check_tls()
         self._check_recording()
+        if self.bundles is not None and not self.bundles.is_dir():
+            raise ServeError(f"--bundles {self.bundles}: no such folder")
+
+    def safety(self) -> Safety:
+        """The limits within which it decides, or ServeError for one that is none."""
+        flags = (
+            ("--deadline-ms", self.deadline_ms),
+            ("--max-age-ms", self.max_age_ms),
+            ("--hold-after-ms", self.hold_after_ms),
+            ("--silent-after-ms", self.silent_after_ms),
+        )
+        for flag, limit in flags:
+            if limit is not None and not (math.isfinite(limit) and limit > 0.0):
+                raise ServeError(f"{flag} must be finite and above 0, got {limit}")
+        if self.max_in_flight < 1 or self.max_in_flight_all < 1:
+            raise ServeError("--max-in-flight and --max-in-flight-all must be at least 1")
+        return Safety(
+            deadline=None if self.deadline_ms is None else self.deadline_ms / 1e3,
+            freshness=Limits(
+                max_age=None if self.max_age_ms is None else self.max_age_ms / 1e3,
+                hold_after=self.hold_after_ms / 1e3,
+                silent_after=self.silent_after_ms / 1e3,
+            ),
+            max_in_flight=self.max_in_flight,
+            max_in_flight_all=self.max_in_flight_all,
+        )
+
+    def _check_tls(self) -> None:
+        if self.tls_cert is None and self.tls_key is None:
+            return
+        if self.tls_cert is None or self.tls_key is None:
+            raise ServeError("--tls-cert and --tls-key go together")
+        for flag, file in (("--tls-cert", self.tls_cert), ("--tls-key", self.tls_key)):
+            try:
+                file.read_bytes()
+            except OSError as error:
+                raise ServeError(f"{flag} {file} cannot be read: {error.strerror}") from error
+        try:
+            # An empty password: OpenSSL would ask the terminal for one.
+            context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+            context.load_cert_chain(self.tls_cert, self.tls_key, password="")
+        except ssl.SSLError as error:
+            why = error.reason or "they hold no PEM, or the key has a passphrase"
+            files = f"--tls-cert {self.tls_cert} and --tls-key {self.tls_key}"
+            raise ServeError(f"{files} are no certificate and its key: {why}") from error
 
     def _check_recording(self) -> None:
         sizes = (
@@ -162,6 +252,9 @@ class DrainingServer(uvicorn.Server):
         drain_seconds: how long it says so [s].
         announcement: a line for stdout, written once it listens and stops in order when told to.
         door: who may stay connected.
+        freshness: which robots it knows.
+        operation: looked at ten times a second.
+        changer: loads the bundle anew on SIGHUP.
     """
 
     def __init__(
@@ -171,9 +264,16 @@ class DrainingServer(uvicorn.Server):
         drain_seconds: float,
         announcement: str,
         door: Door,
+        freshness: Freshness | None = None,
+        operation: Operation | None = None,
+        changer: Changer | None = None,
     ) -> None:
         super().__init__(config)
+        self._operation = operation
+        self._changer = changer
+        self._change: asyncio.Task[None] | None = None
         self.server_state = self._door = door
+        self._freshness = freshness
         self._lifecycle = lifecycle
         self._drain_seconds = drain_seconds
         self._announcement = announcement
@@ -181,7 +281,24 @@ class DrainingServer(uvicorn.Server):
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Starts to listen, and says so."""
-        await super().startup(sockets)
+        await super().startup([])
+        # uvicorn would wait a minute for a TLS handshake, in which the door sees no connection yet.
+        patience = self._door.patience.read if self.config.ssl else None
+        protocol = partial(
+            Connection, config=self.config, server_state=self._door, app_state=self.lifespan.state
+        )
+        self.servers = [
+            await asyncio.get_running_loop().create_server(
+                protocol,
+                sock=listener,
+                ssl=self.config.ssl,
+                ssl_handshake_timeout=patience,
+                backlog=self.config.backlog,
+            )
+            for listener in sockets or []
+        ]
+        if self._changer is not None and hasattr(signal, "SIGHUP"):
+            asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, self._on_hangup, self._changer)
         sys.stdout.write(self._announcement + "\n")
         sys.stdout.flush()
 
@@ -195,12 +312,28 @@ class DrainingServer(uvicorn.Server):
     async def on_tick(self, counter: int) -> bool:
         """Asked ten times a second whether to stop."""
         self._door.sweep(asyncio.get_running_loop().time())
+        if self._freshness is not None:
+            self._freshness.sweep(time.perf_counter())
+        if self._operation is not None:
+            # Not in the signal's handler: it may come in the middle of anything.
+            if self._lifecycle.draining:
+                self._operation.drain()
+            if self._freshness is not None:
+                self._operation.unwell(self._freshness.unwell(time.perf_counter()))
+            self._operation.tick()
         if self._stop_at is not None and time.monotonic() >= self._stop_at:
             self.should_exit = True
         return await super().on_tick(counter)
 
+    def _on_hangup(self, changer: Changer) -> None:
+        async def again() -> None:
+            with suppress(ChangeError):  # it was told
+                await changer.again()
 
-def listen(host: str, port: int, api_key: str | None) -> socket.socket:
+        self._change = asyncio.get_running_loop().create_task(again())
+
+
+def listen(host: str, port: int, keys: Keys) -> socket.socket:
     """Opens the listening socket.
 
     Raises:
@@ -210,7 +343,7 @@ def listen(host: str, port: int, api_key: str | None) -> socket.socket:
         family, kind, protocol, _, address = socket.getaddrinfo(
             host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
         )[0]
-        if api_key is None and not ipaddress.ip_address(address[0]).is_loopback:
+        if not keys.any and not ipaddress.ip_address(address[0]).is_loopback:
             raise ServeError(
                 f"{host} can be reached from other machines: set {KEY_VARIABLE} or --api-key-file, "
                 "or listen on 127.0.0.1"
@@ -225,21 +358,45 @@ def listen(host: str, port: int, api_key: str | None) -> socket.socket:
     return listener
 
 
-def read_api_key(path: Path | None) -> str | None:
-    """The key from a file, else from the environment, else None.
+def read_api_key(path: Path | None, variable: str = KEY_VARIABLE, flag: str = "--api-key-file") -> str | None:
+    """A key from a file, else from the environment, else None.
+
+    Args:
+        path: the file.
+        variable: the environment variable.
+        flag: what named the file, for the error.
 
     Raises:
         ServeError: if the file cannot be read, or the key is empty or not printable ASCII.
     """
     try:
-        key = os.environ.get(KEY_VARIABLE) if path is None else path.read_text(encoding="utf-8").strip()
+        key = os.environ.get(variable) if path is None else path.read_text(encoding="utf-8").strip()
     except (OSError, UnicodeDecodeError) as error:
-        raise ServeError(f"--api-key-file {path}: cannot be read: {error}") from error
+        raise ServeError(f"{flag} {path}: cannot be read: {error}") from error
     if key is None:
         return None
     if not key or not all("!" <= letter <= "~" for letter in key):
-        raise ServeError("the API key must be printable ASCII without spaces, and not empty")
+        named = variable if path is None else f"{flag} {path}"
+        raise ServeError(f"{named}: the API key must be printable ASCII without spaces, and not empty")
     return key
+
+
+def read_keys(config: ServeConfig) -> Keys:
+    """The keys that a service asks for.
+
+    Raises:
+        ServeError: if one cannot be had, or they do not go together.
+    """
+    try:
+        return Keys(
+            read=read_api_key(config.read_key_file, READ_KEY_VARIABLE, "--read-key-file"),
+            act=read_api_key(config.api_key_file),
+            admin=read_api_key(config.admin_key_file, ADMIN_KEY_VARIABLE, "--admin-key-file"),
+        )
+    except ServeError:
+        raise
+    except ValueError as error:
+        raise ServeError(str(error)) from error
 
 
 def read_memory_key(path: Path | None) -> bytes | None:
@@ -284,31 +441,54 @@ def serve(config: ServeConfig) -> None:
 
     Raises:
         ServeError: for settings or an address that cannot be had.
+        AlarmsError: for settings of alarms that cannot be used.
         BundleError: if the bundle must not be used.
         MonitorError: if it cannot be run with these settings.
         RecordingError: if it cannot be recorded.
     """
     config.check()
-    api_key = read_api_key(config.api_key_file)
+    keys = read_keys(config)
     memory_key = read_memory_key(config.memory_key_file)
+    rules = read_rules(config.alarms)
     allow_files(config.max_connections)
-    listener = listen(config.host, config.port, api_key)
+    listener = listen(config.host, config.port, keys)
     with listener:
-        monitor = Monitor.load(
-            config.bundle, config.gate, config.threshold, config.filter_config(), config.guide
-        )
+
+        def load(bundle: Path) -> Monitor:
+            return Monitor.load(bundle, config.gate, config.threshold, config.filter_config(), config.guide)
+
+        monitor = load(config.bundle)
         lifecycle = Lifecycle()
         host, port = listener.getsockname()[:2]
-        url = f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
+        scheme = "http" if config.tls_cert is None else "https"
+        url = f"{scheme}://[{host}]:{port}" if ":" in host else f"{scheme}://{host}:{port}"
         ready = {"event": "listening", "url": url, "host": host, "port": port, "model": monitor.bundle.id}
         gate = {"gate": monitor.gate.name, "threshold": monitor.gate.threshold, "guide": config.guide}
         announcement = json.dumps(ready | gate)
-        with recorder_of(config, monitor) as recorder:
-            app = create_app(monitor, lifecycle, api_key, config.max_body, recorder, memory_key)
+        with Events(config.log) as events, recorder_of(config, monitor) as recorder:
+            safety = config.safety()
+            freshness = Freshness(safety.freshness, monitor.faults.note)
+            operation = Operation(monitor, recorder, rules, events)
+            changer = Changer(operation, load, config.bundle, config.bundles)
+            app = create_app(
+                monitor,
+                lifecycle,
+                keys,
+                config.max_body,
+                recorder,
+                operation=operation,
+                changer=changer,
+                safety=safety,
+                freshness=freshness,
+                memory_key=memory_key,
+            )
             # What is loaded stays: looking through it again and again for garbage would hold up decisions.
             gc.collect()
             gc.freeze()
-            _server(app, lifecycle, config, announcement).run(sockets=[listener])
+            _server(app, lifecycle, config, announcement, freshness, operation, changer).run(
+                sockets=[listener]
+            )
+            operation.stop()
 
 
 def recorder_of(config: ServeConfig, monitor: Monitor) -> AbstractContextManager[Recorder | None]:
@@ -323,10 +503,19 @@ def recorder_of(config: ServeConfig, monitor: Monitor) -> AbstractContextManager
     return Recorder(wanted, ModelReply.of(monitor).model_dump(), asdict(config.filter_config()))
 
 
-def _server(app: Guard, lifecycle: Lifecycle, config: ServeConfig, announcement: str) -> DrainingServer:
+def _server(
+    app: Guard,
+    lifecycle: Lifecycle,
+    config: ServeConfig,
+    announcement: str,
+    freshness: Freshness,
+    operation: Operation,
+    changer: Changer,
+) -> DrainingServer:
     settings = uvicorn.Config(
         app,
         access_log=False,
+        log_config=None,  # `Events` tells what it logs
         log_level="error",  # warnings are of what anybody may send, a line each
         lifespan="off",
         ws=StreamConnection,
@@ -337,15 +526,19 @@ def _server(app: Guard, lifecycle: Lifecycle, config: ServeConfig, announcement:
         http=Connection,
         timeout_keep_alive=math.ceil(config.idle_seconds),
         timeout_graceful_shutdown=_LAST_WORDS,
+        ssl_certfile=config.tls_cert,
+        ssl_keyfile=config.tls_key,
     )
     patience = Patience(config.read_seconds, config.idle_seconds, config.max_connections)
     door = Door(patience, app.is_robots)
-    return DrainingServer(settings, lifecycle, config.drain_seconds, announcement, door)
+    return DrainingServer(
+        settings, lifecycle, config.drain_seconds, announcement, door, freshness, operation, changer
+    )
 
 
 def main() -> None:
     """Entry point of `lagnet-serve`: exit status 0 after an orderly stop, 2 if it could not start."""
-    with command("lagnet-serve", ServeError, BundleError, MonitorError, RecordingError):
+    with command("lagnet-serve", ServeError, AlarmsError, BundleError, MonitorError, RecordingError):
         serve(settings(ServeConfig, "lagnet-serve"))
 
 

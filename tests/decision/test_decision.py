@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from dataclasses import fields
+from dataclasses import FrozenInstanceError, fields
 from itertools import pairwise
 from pathlib import Path
 
@@ -71,6 +71,20 @@ def test_a_decision_is_the_batchs_row(batch) -> None:
         assert type(one.certified) is bool
         assert type(one.barrier) is type(one.risk) is float
         assert one.hazard is None or type(one.hazard) is int
+
+
+def test_a_row_is_whole_and_stays_as_it_is(batch) -> None:
+    one = batch[0]
+    assert list(vars(one)) == [field.name for field in fields(Decision)]
+    with pytest.raises(FrozenInstanceError):
+        one.mode = Mode.NOMINAL
+
+
+def test_what_is_sent_is_changed_unless_it_is_nominal(batch) -> None:
+    assert batch.changed.tolist() == [mode != "nominal" for mode in batch.mode.tolist()]
+    for mode in (texts(Mode.NOMINAL, N), np.array([Mode.NOMINAL] * N, dtype=np.str_)):
+        batch.mode = mode
+        assert batch.changed.tolist() == [False] * N
 
 
 def test_rows_make_the_batch_again(batch) -> None:

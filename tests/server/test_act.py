@@ -18,8 +18,13 @@ from decision import MEMORY, MOST_OPEN, PLAN_STEPS, Decision, Faults, Mode, Open
 from filter import Robot
 from guide import DEFAULT_STRENGTH
 from monitor import Monitor
-from server.app import MANY_FAULTS, Lifecycle, create_app
+from server.alarms import RULES
+from server.app import Lifecycle, create_app
+from server.keys import Keys
 from server.schema import ActReply, decision_of, reply_of
+
+MANY_FAULTS = int(RULES["faults"].limit) + 1
+"""So many internal faults within a minute degrade the service."""
 
 
 def same(value: object, other: object) -> bool:
@@ -210,7 +215,7 @@ def test_an_action_that_is_no_number_never_leaves_and_the_service_degrades(
         assert app.post("/act", json={"observation": observation}).status_code == 500
     reply = app.get("/readyz")
     assert reply.status_code == 503
-    assert reply.json() == {"status": "degraded", "internal_faults": MANY_FAULTS}
+    assert (reply.json()["status"], reply.json()["why"]) == ("degraded", "alarm faults")
     assert app.get("/healthz").status_code == 200
     assert len(caplog.records) == 1
 
@@ -285,7 +290,7 @@ def test_a_stated_length_of_any_size_is_413(app) -> None:
 
 
 def test_the_key_is_asked_for_everywhere_but_at_the_health_checks(monitor, observation) -> None:
-    app = TestClient(create_app(monitor, api_key="secret"))
+    app = TestClient(create_app(monitor, keys=Keys(act="secret")))
     body = {"observation": observation}
     for headers in ({}, {"authorization": "Bearer wrong"}, {"authorization": "secret"}, {"x-api-key": ""}):
         assert app.post("/act", json=body, headers=headers).status_code == 401
