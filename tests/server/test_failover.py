@@ -85,7 +85,9 @@ def test_without_another_the_robot_plays_its_plan_then_holds_until_it_is_told_to
     assert client.held is not None
     # Started anew, it takes the memory that it had sealed in its former life, but for what was played.
     with start(tiny_bundle, key, port):
-        assert "held" in str(client.decide(OBSERVATION, NEAR, memory).reason)
+        decision = client.decide(OBSERVATION, NEAR, memory)
+        assert "held" in str(decision.reason)
+        memory = decision.memory
         client.resume()
         decision = client.decide(OBSERVATION, NEAR, memory)
         assert decision.opened_by == "always"
