@@ -37,6 +37,7 @@ from evaluation.service import Service
 from monitor import GateName, Monitor
 from pointgoal.lidar import encode
 from pointgoal.observation import layout
+from server.duty import OnDuty
 from server.keeper import KEY_BYTES, Keeper, Past
 from server.keys import Keys
 from server.serve import listen
@@ -205,12 +206,12 @@ def cases(level: int, memory: str) -> dict[str, Case]:
     }
 
 
-def full_memory(model: str, key: bytes) -> str:
+def full_memory(monitor: Monitor, key: bytes) -> str:
     """A memory with a whole plan, as the service of a key sends it."""
     memory = np.zeros(1, MEMORY)
     memory["side"], memory["planned"], memory["left"] = 5, True, PLAN_STEPS
     memory["plan"] = (0.05, 0.5)
-    return Keeper(key, Faults()).seal(memory[0], None, model, Past(None, None, None))
+    return Keeper(key, Faults()).seal(memory[0], None, OnDuty.of(monitor).robot, Past(None, None, None))
 
 
 def in_process(monitor: Monitor, asked: dict[str, Any], calls: int) -> tuple[float, float]:
@@ -231,7 +232,7 @@ def over_http(url: str, case: Case, config: ServerBenchmark) -> list[float]:
     if case.mode is not None:
         read = msgpack.unpackb if url.endswith("#msgpack") else json.loads
         if (mode := read(connection.exchange())["mode"]) != case.mode:
-            raise RuntimeError(f"the decision is {mode}, expected {case.mode}")
+            raise RuntimeError(f"{url}: the decision is {mode}, expected {case.mode}")
     connection.times(50)
     p50, p99 = np.percentile(connection.times(config.requests), [50, 99]) * 1e6
     connection.close()
@@ -243,7 +244,7 @@ def run(config: ServerBenchmark) -> dict[str, list[float]]:
     """Starts both services, measures them in turn, stops them; the medians over rounds."""
     monitor = Monitor.load(config.bundle, config.gate)
     key = secrets.token_bytes(KEY_BYTES)
-    measured = cases(monitor.bundle.manifest.level, full_memory(monitor.bundle.id, key))
+    measured = cases(monitor.bundle.manifest.level, full_memory(monitor, key))
     seen: dict[str, list[list[float]]] = {}
     with ExitStack() as stack:
         file = stack.enter_context(NamedTemporaryFile())

@@ -18,6 +18,7 @@ from decision import MEMORY, Faults
 from monitor import Monitor
 from pointgoal.lidar import encode
 from server.app import create_app
+from server.duty import OnDuty
 from server.keeper import Keeper, Past
 from server.schema import ModelReply
 
@@ -48,7 +49,7 @@ def sealed(monitor: Monitor) -> Callable[..., str]:
         memory["plan"][0, : len(plan)] = np.reshape(plan, (-1, 2))
         for name, value in fields.items():
             memory[name] = value
-        return keeper.seal(memory[0], robot, monitor.bundle.id, Past(None, None, None))
+        return keeper.seal(memory[0], robot, OnDuty.of(monitor).robot, Past(None, None, None))
 
     return seal
 
