@@ -191,8 +191,8 @@ class Told(Monitor):
         self.__dict__ |= monitor.__dict__ | {"faults": Faults()}
         self.changes = changes
 
-    def decide(self, observation, hazards=None, memory=None) -> Decision:
-        return dataclasses.replace(super().decide(observation, hazards, memory), **self.changes)
+    def decide_lost(self, observation, hazards, memory, lost) -> Decision:
+        return dataclasses.replace(super().decide_lost(observation, hazards, memory, lost), **self.changes)
 
 
 def test_numbers_that_are_none_leave_as_null(monitor, strict_json, observation) -> None:
