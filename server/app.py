@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 from fastapi import FastAPI
 from fastapi.responses import JSONResponse
+from starlette.types import ASGIApp
 
 from monitor import Monitor
 from recorder import Recorder
@@ -46,6 +48,7 @@ def create_app(
     api_key: str | None = None,
     max_body: int = MAX_BODY,
     recorder: Recorder | None = None,
+    around: Callable[[ASGIApp], ASGIApp] | None = None,
 ) -> Guard:
     """The service around one monitor that is loaded and warmed up.
 
@@ -55,6 +58,7 @@ def create_app(
         api_key: the key that every request but the health checks must carry; None asks for none.
         max_body: most bytes of a request's body; a batch's may be `BATCH_BODY` times as large.
         recorder: what records the decisions, if any does.
+        around: what stands between the guard and the service, if anything does.
     """
     state = lifecycle or Lifecycle()
     model = ModelReply.of(monitor)
@@ -94,7 +98,8 @@ def create_app(
         return JSONResponse({"status": "ready"})
 
     observers: list[Observer] = [] if recorder is None else [Recording(recorder)]
-    return Guard(Desk(app, monitor, model, observers), api_key, max_body, {BATCH: BATCH_BODY * max_body})
+    desk: ASGIApp = Desk(app, monitor, model, observers)
+    return Guard(desk if around is None else around(desk), api_key, max_body, {BATCH: BATCH_BODY * max_body})
 
 
 def _act_schema(model: ModelReply) -> dict[str, Any]:

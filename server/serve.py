@@ -26,6 +26,7 @@ from models import BundleError
 from monitor import DEFAULT_STRENGTH, GateName, Monitor, MonitorError, Strength
 from recorder import Recorder, RecordingError, Settings
 from server.app import MAX_BODY, Lifecycle, create_app
+from server.crew import Crew
 from server.door import Connection, Door, Patience
 from server.guard import Guard
 from server.schema import ModelReply
@@ -58,6 +59,9 @@ class ServeConfig:
     """Address to listen on. Beyond loopback a key is required."""
     port: int = 8000
     """Port to listen on; 0 takes a free one."""
+    workers: int = 1
+    """Processes behind the one address; one that dies is started again. What is told by each, /metrics for
+    example, is told of all; limits are each worker's, room for recordings is shared out among them."""
     gate: GateName = "risk"
     """When the filter is active: where the risk score or the barrier asks for it, always, never."""
     threshold: float | None = None
@@ -112,6 +116,8 @@ class ServeConfig:
         self.filter_config()
         if not 0 <= self.port <= 65535:
             raise ServeError(f"--port must be 0 to 65535, got {self.port}")
+        if self.workers < 1:
+            raise ServeError(f"--workers must be at least 1, got {self.workers}")
         if self.max_body < 1 or self.max_connections < 1:
             raise ServeError("--max-body and --max-connections must be at least 1")
         for flag, seconds in (("--read-seconds", self.read_seconds), ("--idle-seconds", self.idle_seconds)):
@@ -124,8 +130,8 @@ class ServeConfig:
     def _check_recording(self) -> None:
         sizes = (
             ("--record-file-mb", self.record_file_mb, LEAST_FILE),
-            ("--record-mb", self.record_mb, 2.0 * self.record_file_mb),
-            ("--incidents-mb", self.incidents_mb, 4.0 * LEAST_FILE),
+            ("--record-mb", self.record_mb, 2.0 * self.record_file_mb * self.workers),
+            ("--incidents-mb", self.incidents_mb, 4.0 * LEAST_FILE * self.workers),
         )
         for flag, size, least in sizes:
             if not (math.isfinite(size) and size >= least):
@@ -157,6 +163,7 @@ class DrainingServer(uvicorn.Server):
         drain_seconds: how long it says so [s].
         announcement: a line for stdout, written once it listens and stops in order when told to.
         door: who may stay connected.
+        crew: the workers that it is one of.
     """
 
     def __init__(
@@ -166,8 +173,10 @@ class DrainingServer(uvicorn.Server):
         drain_seconds: float,
         announcement: str,
         door: Door,
+        crew: Crew | None = None,
     ) -> None:
         super().__init__(config)
+        self._crew = crew
         self.server_state = self._door = door
         self._lifecycle = lifecycle
         self._drain_seconds = drain_seconds
@@ -176,6 +185,8 @@ class DrainingServer(uvicorn.Server):
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Starts to listen, and says so."""
+        if self._crew is not None:
+            await self._crew.start()
         await super().startup(sockets)
         sys.stdout.write(self._announcement + "\n")
         sys.stdout.flush()
@@ -257,8 +268,13 @@ def allow_files(connections: int) -> None:
         resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
 
 
-def serve(config: ServeConfig) -> None:
+def serve(config: ServeConfig, crew: Crew | None = None, listener: socket.socket | None = None) -> None:
     """Serves until told to stop.
+
+    Args:
+        config: the settings.
+        crew: the workers that this process is one of.
+        listener: the listening socket, if there is one already.
 
     Raises:
         ServeError: for settings or an address that cannot be had.
@@ -269,7 +285,12 @@ def serve(config: ServeConfig) -> None:
     config.check()
     api_key = read_api_key(config.api_key_file)
     allow_files(config.max_connections)
-    listener = listen(config.host, config.port, api_key)
+    listener = listener or listen(config.host, config.port, api_key)
+    if config.workers > 1:
+        from server.workers import supervise
+
+        supervise(config, listener)
+        return
     with listener:
         monitor = Monitor.load(
             config.bundle, config.gate, config.threshold, config.filter_config(), config.guide
@@ -281,11 +302,13 @@ def serve(config: ServeConfig) -> None:
         gate = {"gate": monitor.gate.name, "threshold": monitor.gate.threshold, "guide": config.guide}
         announcement = json.dumps(ready | gate)
         with recorder_of(config, monitor) as recorder:
-            app = create_app(monitor, lifecycle, api_key, config.max_body, recorder)
+            app = create_app(
+                monitor, lifecycle, api_key, config.max_body, recorder, crew.around if crew else None
+            )
             # What is loaded stays: looking through it again and again for garbage would hold up decisions.
             gc.collect()
             gc.freeze()
-            _server(app, lifecycle, config, announcement).run(sockets=[listener])
+            _server(app, lifecycle, config, announcement, crew).run(sockets=[listener])
 
 
 def recorder_of(config: ServeConfig, monitor: Monitor) -> AbstractContextManager[Recorder | None]:
@@ -300,7 +323,9 @@ def recorder_of(config: ServeConfig, monitor: Monitor) -> AbstractContextManager
     return Recorder(wanted, ModelReply.of(monitor).model_dump(), asdict(config.filter_config()))
 
 
-def _server(app: Guard, lifecycle: Lifecycle, config: ServeConfig, announcement: str) -> DrainingServer:
+def _server(
+    app: Guard, lifecycle: Lifecycle, config: ServeConfig, announcement: str, crew: Crew | None
+) -> DrainingServer:
     settings = uvicorn.Config(
         app,
         access_log=False,
@@ -314,7 +339,7 @@ def _server(app: Guard, lifecycle: Lifecycle, config: ServeConfig, announcement:
     )
     patience = Patience(config.read_seconds, config.idle_seconds, config.max_connections)
     door = Door(patience, app.is_robots)
-    return DrainingServer(settings, lifecycle, config.drain_seconds, announcement, door)
+    return DrainingServer(settings, lifecycle, config.drain_seconds, announcement, door, crew)
 
 
 def main() -> None:
