@@ -78,7 +78,8 @@ class Supervisor:
         self._listener = listener
         self._roster = Roster(config.workers)
         self._running: dict[int, Process] = {}
-        self._stop = asyncio.Event()
+        self._stop, self._anew = asyncio.Event(), asyncio.Event()
+        self._starting = asyncio.Lock()
 
     async def run(self) -> None:
         """Serves until told to stop.
@@ -89,6 +90,8 @@ class Supervisor:
         loop = asyncio.get_running_loop()
         for number in (signal.SIGTERM, signal.SIGINT):
             loop.add_signal_handler(number, self._end)
+        loop.add_signal_handler(signal.SIGHUP, self._anew.set)
+        renewal = asyncio.create_task(self._renew())
         try:
             # Settings that cannot be served are told by the first alone, and it compiles for the others.
             first, *others = self._orders
@@ -100,14 +103,20 @@ class Supervisor:
             sys.stdout.flush()
             await asyncio.gather(*map(self._keep, self._orders))
         finally:
+            renewal.cancel()
             if not self._stop.is_set():
                 self._end()
             await asyncio.gather(*(process.wait() for process in self._running.values()))
 
     async def _start(self, number: int) -> bytes:
-        """Starts a worker; what it says when it listens, or nothing if it ended before."""
-        if self._stop.is_set():
-            return b""
+        """Starts a worker in the place of one that ended; what it says when it listens, or nothing."""
+        self._running[number] = process = await self._spawn(number)
+        if said := await _announcement(process):
+            self._roster.ready = sorted({*self._roster.ready, number})
+            self._tell()
+        return said
+
+    async def _spawn(self, number: int) -> Process:
         process = await asyncio.create_subprocess_exec(
             *(sys.executable, "-m", "server.worker"),
             stdin=PIPE,
@@ -115,26 +124,23 @@ class Supervisor:
             pass_fds=[self._listener.fileno()],
             process_group=0,  # Ctrl-C in the terminal reaches the supervisor alone
         )
-        self._running[number] = process
+        assert process.stdin is not None
+        process.stdin.write(ORDER.dump_json(self._orders[number]) + b"\n")
         if self._stop.is_set():  # meanwhile
             process.terminate()
-        assert process.stdin is not None
-        assert process.stdout is not None
-        process.stdin.write(ORDER.dump_json(self._orders[number]) + b"\n")
-        if said := await process.stdout.readline():
-            self._roster.ready.append(number)
-            self._tell()
-        return said
+        return process
 
     async def _keep(self, number: int) -> None:
         """Watches over a worker that listens, and starts it again when it ends."""
         loop = asyncio.get_running_loop()
         pause = 0.0
         while True:
-            since = loop.time()
-            status = await self._running[number].wait()
+            since, process = loop.time(), self._running[number]
+            status = await process.wait()
             if self._stop.is_set():
                 return
+            if self._running[number] is not process:
+                continue  # another took its place
             roster = self._roster
             roster.ready = [other for other in roster.ready if other != number]
             roster.restarts += 1
@@ -146,7 +152,30 @@ class Supervisor:
             with suppress(TimeoutError):
                 await asyncio.wait_for(self._stop.wait(), pause)
                 return
-            await self._start(number)
+            async with self._starting:
+                if self._running[number] is process:
+                    await self._start(number)
+
+    async def _renew(self) -> None:
+        """On SIGHUP puts a new process in the place of each worker, which drains once the new one listens.
+
+        The first that cannot start ends it: the bundle may be no good, and the old workers serve on.
+        """
+        while True:
+            await self._anew.wait()
+            self._anew.clear()
+            for number in self._orders:
+                async with self._starting:
+                    process = await self._spawn(number)
+                    if not await _announcement(process):
+                        _LOG.error("worker %d could not be started anew: those that run stay", number)
+                        break
+                    old, self._running[number] = self._running[number], process
+                with suppress(ProcessLookupError):
+                    old.terminate()
+                self._roster.ready = sorted({*self._roster.ready, number})
+                self._tell()
+                _LOG.warning("worker %d was started anew", number)
 
     def _tell(self) -> None:
         """Tells every worker where the others stand."""
@@ -163,6 +192,12 @@ class Supervisor:
         for process in self._running.values():
             with suppress(ProcessLookupError):
                 process.terminate()
+
+
+async def _announcement(process: Process) -> bytes:
+    """What a worker says when it listens; nothing if it ended before."""
+    assert process.stdout is not None
+    return await process.stdout.readline()
 
 
 def _how(status: int) -> str:

@@ -74,7 +74,7 @@ def service() -> Iterator[Service]:
 
 def test_robots_drive_on_while_one_worker_after_the_other_is_killed(service: Service) -> None:
     before = get(service, "/healthz")[1]
-    assert (before["workers"], sorted(before["ready"]), before["restarts"]) == (2, [1, 2], 0)
+    assert (before["workers"], before["ready"], before["restarts"]) == (2, [1, 2], 0)
     first, second = children(service)
     steps = 0
 
@@ -89,10 +89,10 @@ def test_robots_drive_on_while_one_worker_after_the_other_is_killed(service: Ser
             os.kill(second, signal.SIGKILL)
 
     with Fleet(service.url, timeout=1.0) as fleet:
-        episodes = run_episodes("PointGoal1-v0", fleet, 4, seed=31, progress=kill)
-    assert episodes.violating_steps.tolist() == [0, 0, 0, 0]
+        episodes = run_episodes("PointGoal1-v0", fleet, 2, seed=31, progress=kill)
+    assert episodes.violating_steps.tolist() == [0, 0]
     # Each robot has lost at most the requests that were under way; then another worker had it.
-    assert len([reason for reason in episodes.reasons if reason.startswith("service")]) <= 8
+    assert len([reason for reason in episodes.reasons if reason.startswith("service")]) <= 4
     assert episodes.reasons
     until(lambda: len(get(service, "/healthz")[1]["ready"]) == 2)
     status, after = get(service, "/healthz")
@@ -127,6 +127,27 @@ def sockets_of(pid: int) -> int:
     return sum(row[3] == "01" and row[9] in own for row in rows)
 
 
+@pytest.mark.long
+def test_a_hangup_changes_the_bundle_and_a_bad_one_is_left_aside(tiny_bundle: Path, tmp_path: Path) -> None:
+    """A new worker listens before the old one goes."""
+    link = tmp_path / "bundle"
+    link.symlink_to(tiny_bundle)
+    with started(link) as service:
+        old = children(service)
+        link.unlink()
+        service.process.send_signal(signal.SIGHUP)
+        until(lambda: "those that run stay" in service.complaints())
+        assert children(service) == old
+        link.symlink_to(BUNDLE)
+        service.process.send_signal(signal.SIGHUP)
+        until(lambda: service.complaints().count("was started anew") == 2)
+        until(lambda: not set(old) & set(children(service)))
+        status, said = get(service, "/model")
+        assert (status, said["algorithm"]) == (200, "lagnet-foresight")
+        assert get(service, "/healthz")[1]["restarts"] == 0
+
+
+@pytest.mark.long
 def test_a_stop_drains_every_worker_and_each_has_recorded(tiny_bundle, observation, tmp_path) -> None:
     with started(tiny_bundle, "--drain-seconds", "1.0", "--record", str(tmp_path)) as service:
         client = Client(service.url, timeout=5.0)
@@ -147,6 +168,7 @@ def test_a_stop_drains_every_worker_and_each_has_recorded(tiny_bundle, observati
     assert len(list(tmp_path.glob("worker-?/recording-*.mcap"))) == 1
 
 
+@pytest.mark.long
 def test_workers_whose_supervisor_is_killed_stop_by_themselves(tiny_bundle: Path) -> None:
     service = started(tiny_bundle)
     pids = children(service)
