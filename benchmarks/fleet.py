@@ -11,11 +11,13 @@ from __future__ import annotations
 import json
 import os
 import socket
-import subprocess
 import sys
 from collections.abc import Iterator
+from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from itertools import repeat
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Annotated
 
@@ -49,33 +51,10 @@ class FleetBenchmark:
     """Processes that the load comes from, where there are so many clients."""
 
 
-def load(url: str, body: bytes, clients: int, requests: int, generators: int) -> float:
+def load(generators: Executor, processes: int, url: str, body: bytes, clients: int, requests: int) -> float:
     """Requests a second over several connections, from several processes."""
-    generators = min(generators, clients)
-    share = [clients // generators + (i < clients % generators) for i in range(generators)]
-    command = [sys.executable, "-m", "benchmarks.fleet", "--generate", url]
-    running = [
-        subprocess.Popen([*command, str(n), str(requests)], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
-        for n in share
-    ]
-    for process in running:  # once all of them are there
-        assert process.stdout is not None
-        process.stdout.readline()
-    rates = []
-    for process in running:
-        assert process.stdin is not None
-        process.stdin.write(body + b"\n")
-        process.stdin.flush()
-    for process in running:
-        rates.append(float(process.communicate()[0]))
-    return sum(rates)
-
-
-def generate(url: str, clients: int, requests: int) -> None:
-    """One process of the load."""
-    print(flush=True)
-    body = sys.stdin.buffer.readline().strip()
-    print(throughput(url, body, clients, requests))
+    share = [clients // processes + (i < clients % processes) for i in range(min(processes, clients))]
+    return sum(generators.map(throughput, repeat(url), repeat(body), share, repeat(requests)))
 
 
 def one_client(url: str, case: Case, requests: int) -> tuple[float, float]:
@@ -109,12 +88,10 @@ def services(config: FleetBenchmark) -> Iterator[dict[str, Service]]:
 
 def main() -> None:
     """Entry point of `python -m benchmarks.fleet`."""
-    if sys.argv[1:2] == ["--generate"]:
-        generate(sys.argv[2], int(sys.argv[3]), int(sys.argv[4]))
-        return
     config = tyro.cli(FleetBenchmark, prog="python -m benchmarks.fleet")
     seen: dict[str, list[list[float]]] = {}
-    with services(config) as started:
+    generators = ProcessPoolExecutor(config.generators, get_context("fork"))
+    with generators, services(config) as started:
         case = Case(cases(1)["nominal"].asked, Mode.NOMINAL)
         for _ in range(config.rounds):
             for name, service in started.items():
@@ -122,7 +99,8 @@ def main() -> None:
                 # A tenth of them: what Ray Serve takes for as many would be minutes.
                 requests = config.requests // 10 if name.startswith("Ray") else config.requests
                 rates = [
-                    load(url, case.body, n, max(1, requests // n), config.generators) for n in config.clients
+                    load(generators, config.generators, url, case.body, n, max(1, requests // n))
+                    for n in config.clients
                 ]
                 seen.setdefault(name, []).append([*one_client(url, case, requests), *rates])
     table = Table("", "p50 [µs]", "p99 [µs]", "p50 / first")
@@ -136,7 +114,7 @@ def main() -> None:
         table.add_row(name, *told)
     console = Console(width=120)
     console.print(table)
-    console.print(f"{os.cpu_count()} cores; load from {config.generators} processes, in between")
+    console.print(f"{os.cpu_count()} cores; load from {config.generators} more processes")
 
 
 if __name__ == "__main__":

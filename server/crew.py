@@ -111,7 +111,12 @@ class Crew:
     async def all(self, path: str) -> Told:
         """What all workers answer to a GET, as one answer; the worst of their statuses is its."""
         numbers = range(1, len(self._places) + 1)
-        answers = await asyncio.gather(*(self._ask(number, path) for number in numbers))
+        answers = await asyncio.gather(
+            *(
+                self._own(path) if number == self._number else ask(self._places[number - 1], path)
+                for number in numbers
+            )
+        )
         told = {number: answer for number, answer in zip(numbers, answers, strict=True) if answer is not None}
         worst = max(told.values(), key=lambda answer: answer.status)
         if path != METRICS:
@@ -137,22 +142,6 @@ class Crew:
                 ("lagnet_worker_restarts_total", "counter", "Workers started again", roster.restarts),
             )
         )
-
-    async def _ask(self, number: int, path: str) -> Told | None:
-        """What one worker answers; None if it does not."""
-        if number == self._number:
-            return await self._own(path)
-        with suppress(OSError, ValueError, TimeoutError):
-            async with asyncio.timeout(_ANSWER_SECONDS):
-                reader, writer = await asyncio.open_unix_connection(self._places[number - 1])
-                try:
-                    writer.write(path.encode() + b"\n")
-                    head, _, body = (await reader.read()).partition(b"\n")
-                finally:
-                    writer.close()
-                status, kind = head.split(b" ", 1)
-                return Told(int(status), body, kind)
-        return None
 
     async def _tell(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Answers another worker."""
@@ -185,6 +174,26 @@ class Crew:
         }
         await self._app(scope, receive, send)
         return Told(status, b"".join(parts), kind)
+
+
+async def ask(place: Path, path: str) -> Told | None:
+    """What a worker answers to a GET; None if it does not.
+
+    Args:
+        place: its socket.
+        path: one of `ALL_WORKERS`.
+    """
+    with suppress(OSError, ValueError, TimeoutError):
+        async with asyncio.timeout(_ANSWER_SECONDS):
+            reader, writer = await asyncio.open_unix_connection(place)
+            try:
+                writer.write(path.encode() + b"\n")
+                head, _, body = (await reader.read()).partition(b"\n")
+            finally:
+                writer.close()
+            status, kind = head.split(b" ", 1)
+            return Told(int(status), body, kind)
+    return None
 
 
 def labelled(texts: Mapping[int, str]) -> str:

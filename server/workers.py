@@ -18,12 +18,14 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
-from server.crew import Roster
+from server.crew import Roster, ask
 from server.serve import ServeConfig
 from server.worker import ORDER, ROSTER, Order
 
 _SOON = 10.0
 """Where a worker ends within this time [s], it is not started again at once."""
+_MOST_SILENT = 5
+"""A worker that was asked so many times in a row and did not answer is killed."""
 _FIRST_PAUSE, _LONGEST_PAUSE = 0.5, 30.0
 _FAILED = 2
 
@@ -136,7 +138,9 @@ class Supervisor:
         pause = 0.0
         while True:
             since, process = loop.time(), self._running[number]
+            watch = asyncio.create_task(self._watch(number, process))
             status = await process.wait()
+            watch.cancel()
             if self._stop.is_set():
                 return
             if self._running[number] is not process:
@@ -155,6 +159,16 @@ class Supervisor:
             async with self._starting:
                 if self._running[number] is process:
                     await self._start(number)
+
+    async def _watch(self, number: int, process: Process) -> None:
+        """Kills a worker that hangs."""
+        place, silent = self._orders[number].places[number - 1], 0
+        while silent < _MOST_SILENT:
+            await asyncio.sleep(1.0)
+            silent = silent + 1 if await ask(place, "/healthz") is None else 0
+        if not self._stop.is_set() and self._running[number] is process:
+            _LOG.error("worker %d does not answer and is killed", number)
+            process.kill()
 
     async def _renew(self) -> None:
         """On SIGHUP puts a new process in the place of each worker, which drains once the new one listens.

@@ -128,6 +128,25 @@ def sockets_of(pid: int) -> int:
 
 
 @pytest.mark.long
+def test_a_worker_that_hangs_is_replaced_and_no_robot_waits_for_it(tiny_bundle: Path, observation) -> None:
+    with started(tiny_bundle) as service:
+        hung, _ = children(service)
+        os.kill(hung, signal.SIGSTOP)
+        answered = []
+        until(lambda: answered.append(decided(service, observation)) or gone(hung))
+        assert answered.count(True) >= 1
+        until(lambda: len(get(service, "/healthz")[1]["ready"]) == 2)
+        assert get(service, "/healthz")[1]["last"] == "worker 1 was killed by SIGKILL"
+        assert "worker 1 does not answer and is killed" in service.complaints()
+
+
+def decided(service: Service, observation: list[float]) -> bool:
+    """Whether a robot that connects now gets its decision."""
+    with Client(service.url, timeout=1.0) as client:
+        return client.decide(observation).opened_by != "fault"
+
+
+@pytest.mark.long
 def test_a_hangup_changes_the_bundle_and_a_bad_one_is_left_aside(tiny_bundle: Path, tmp_path: Path) -> None:
     """A new worker listens before the old one goes."""
     link = tmp_path / "bundle"
