@@ -34,6 +34,7 @@ from evaluation.service import Service
 from monitor import GateName, Monitor
 from pointgoal.lidar import encode
 from pointgoal.observation import layout
+from server.keys import Keys
 from server.serve import listen
 
 
@@ -216,7 +217,7 @@ def serve_echo() -> None:
     async def echo(body: Echo) -> Echo:
         return body
 
-    listener = listen("127.0.0.1", 0, None)
+    listener = listen("127.0.0.1", 0, Keys())
     print(json.dumps({"url": f"http://127.0.0.1:{listener.getsockname()[1]}"}), flush=True)
     uvicorn.Server(uvicorn.Config(app, access_log=False, log_level="warning", ws="none")).run(
         sockets=[listener]

@@ -110,7 +110,7 @@ def show(
     picture, animation = out / "episode.png", out / "episode.gif"
     headline = f"One robot, one policy, three gates: episode {shown + 1} of {len(runs['off'].returns)}"
     draw_drives(picture, drives, threshold, headline)
-    animate(animation, {gate: drives[gate] for gate in ("off", "always")})
+    animate(animation, {gate: drives[gate] for gate in ("off", "risk")})
     console.print(f"{picture}: the paths, and over time the gate, what was sent, λ, barrier and cost")
     console.print(f"{animation}: the same episode without and with the filter")
 

@@ -286,13 +286,12 @@ def _draw_over_time(
     _draw_gates(gate_row, {gate: one for gate, one in drives.items() if (one.opened_by != "").any()})
     for gate, one in drives.items():
         seconds = np.arange(len(one.cost)) * STEP_SECONDS
-        name = _GATE_NAMES.get(gate, gate)
         style: dict[str, Any] = {
             "color": _GATE_COLOURS.get(gate, _INK),
             "ls": _GATE_LINES.get(gate, "-"),
             "lw": 1.5,
         }
-        risk.plot(seconds, one.risk, label=name, **style)
+        risk.plot(seconds, one.risk, label=f"gate {gate}", **style)
         barrier.plot(seconds, one.barrier, **style)
         cost.plot(seconds, np.cumsum(one.cost), **style)
     risk.set_ylim(bottom=0.0)
@@ -318,7 +317,9 @@ def _draw_over_time(
             parted.step * STEP_SECONDS, 1.02, "×", transform=gate_row.get_xaxis_transform(), ha="center"
         )
     cost.set_xlabel("time [s]", labelpad=1)
-    cost.legend(*risk.get_legend_handles_labels(), loc="center right", ncols=len(drives), frameon=False)
+    # Beside the axes too: a cost may be anywhere.
+    place: dict[str, Any] = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.05)}
+    cost.legend(*risk.get_legend_handles_labels(), frameon=False, fontsize=8, handlelength=1.4, **place)
 
 
 def _draw_gates(axes: Axes, drives: Mapping[str, Drive]) -> None:

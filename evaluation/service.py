@@ -18,10 +18,11 @@ from typing import IO, Self
 
 from evaluation.errors import ServiceError
 from monitor import GateName
-from server.serve import KEY_VARIABLE
+from server.serve import ADMIN_KEY_VARIABLE, KEY_VARIABLE, READ_KEY_VARIABLE
 
 _START_SECONDS = 180.0
 _STOP_SECONDS = 10.0
+_KEYS = (READ_KEY_VARIABLE, KEY_VARIABLE, ADMIN_KEY_VARIABLE)
 # Looked up here: between fork and exec nothing may wait for a lock that another thread held.
 _PRCTL = ctypes.CDLL(None).prctl if sys.platform == "linux" else None
 _PR_SET_PDEATHSIG = 1
@@ -68,7 +69,7 @@ class Service:
             ServiceError: if it ends or does not listen within three minutes (a first start compiles).
         """
         # It is ours alone and asks for no key, unless the command names one.
-        environment = {name: value for name, value in os.environ.items() if name != KEY_VARIABLE}
+        environment = {name: value for name, value in os.environ.items() if name not in _KEYS}
         # A session of its own: Ctrl-C in the terminal reaches us alone, and we stop the service in order.
         # A file, not a pipe: nobody reads it while the service runs, and a full pipe would block it.
         errors = tempfile.TemporaryFile("w+")  # noqa: SIM115  (it lives as long as the service)

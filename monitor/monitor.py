@@ -159,7 +159,7 @@ class Monitor:
             row = np.array(observation, dtype=np.float64)[None]
             given = None if hazards is None else hazards_of_one(hazards)
         except (TypeError, ValueError) as error:
-            return self._fall_back(past, self._bad(error))[0]
+            return self.fall_back(past, self._bad(error))[0]
         return self._decide_or_fall_back(row, given, past, lost)[0]
 
     def decide_batch(
@@ -193,13 +193,17 @@ class Monitor:
             return self._decide(observation, hazards, memory, lost)
         except Exception as error:  # noqa: BLE001 - whatever it is, the robot needs an action
             if len(observation) <= 1:
-                return self._fall_back(memory, self._note(error))
+                return self.fall_back(memory, self._note(error))
         # Something in one row spoils the batch: decide one by one, so that only its own robot gets the
         # fallback.
         rows = [slice(i, i + 1) for i in range(len(observation))]
         near = [None if hazards is None else hazards[i] for i in rows]
         alone = zip((observation[i] for i in rows), near, (memory[i] for i in rows), strict=True)
         return Decisions.join([self._decide_or_fall_back(*robot) for robot in alone])
+
+    def fall_back(self, memory: Memory, reason: str) -> Decisions:
+        """The fallback of N robots with this memory (N,): their plans, then the bundle's safe action."""
+        return fall_back(memory, reason, self.gate.threshold, self._safe)
 
     def _decide(
         self, observation: FloatArray, hazards: FloatArray | None, memory: Memory, lost: str | None
@@ -293,9 +297,6 @@ class Monitor:
     def _bad(self, error: Exception) -> str:
         self.faults.note("bad input", str(error))
         return f"bad input: {error}"
-
-    def _fall_back(self, memory: Memory, reason: str) -> Decisions:
-        return fall_back(memory, reason, self.gate.threshold, self._safe)
 
     def _warm_up(self) -> None:
         """Runs every part once, or raises MonitorError if not even a robot at rest can be decided about."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -38,14 +39,17 @@ _PAUSE = 0.5
 """A longer silence is not drawn through [s]."""
 
 
-def draw(path: Path, timeline: Timeline, robot: int, title: str) -> None:
+def draw(
+    path: Path, timeline: Timeline, robot: int, title: str, largest: Sequence[float] = (1.0, 1.0)
+) -> None:
     """Draws λ against its threshold, the barrier, what became of the actions, and the actions.
 
     Args:
         path: the PNG to write.
         timeline: the recording.
         robot: whose decisions.
-        title: a line above.
+        title: a line above, or two.
+        largest: thrust and turn: actions are drawn as shares of these.
 
     Raises:
         ImportError: if there is no matplotlib.
@@ -60,12 +64,12 @@ def draw(path: Path, timeline: Timeline, robot: int, title: str) -> None:
     with rc_context({"font.size": 9.5, "axes.edgecolor": _GREY, "text.color": _INK, "axes.labelcolor": _INK}):
         figure = Figure(figsize=(11.0, 7.2), layout="constrained")
         FigureCanvasAgg(figure)
-        figure.suptitle(title, fontsize=12, fontweight="bold", x=0.01, ha="left")
+        figure.suptitle(title, fontsize=11, fontweight="bold", x=0.01, ha="left")
         axes = figure.subplots(4, 1, sharex=True, height_ratios=(1.2, 1.2, 0.6, 1.4))
         _draw_risk(axes[0], seconds, rows)
         _draw_barrier(axes[1], seconds, rows)
         _draw_ribbons(axes[2], seconds, rows)
-        _draw_actions(axes[3], seconds, rows)
+        _draw_actions(axes[3], seconds, rows, largest)
         for one in axes:
             one.set_facecolor(_PANEL)
             for side in ("top", "right"):
@@ -92,7 +96,7 @@ def _draw_risk(axes: Axes, seconds: FloatArray, rows: list[Row]) -> None:
     _line(axes, seconds, [row.threshold for row in rows], **threshold)
     axes.set_ylim(bottom=0.0)
     axes.set_ylabel("λ")
-    axes.legend(loc="upper left", ncols=2, frameon=False, fontsize=8.5)
+    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, fontsize=8.5)
 
 
 def _draw_barrier(axes: Axes, seconds: FloatArray, rows: list[Row]) -> None:
@@ -124,16 +128,17 @@ def _draw_ribbons(axes: Axes, seconds: FloatArray, rows: list[Row]) -> None:
     axes.legend(handles=patches, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, fontsize=8.5)
 
 
-def _draw_actions(axes: Axes, seconds: FloatArray, rows: list[Row]) -> None:
+def _draw_actions(axes: Axes, seconds: FloatArray, rows: list[Row], largest: Sequence[float]) -> None:
     for place, (name, colour) in enumerate((("thrust", _THRUST), ("turn", _TURN))):
-        _line(axes, seconds, [row.action[place] for row in rows], color=colour, lw=1.4, label=f"{name}, sent")
+        sent = [row.action[place] / largest[place] for row in rows]
+        _line(axes, seconds, sent, color=colour, lw=1.4, label=f"{name}, sent")
         nominal: dict[str, Any] = {
             "color": colour,
             "lw": 0.8,
             "ls": (0, (2, 2)),
             "label": f"{name}, the policy's",
         }
-        _line(axes, seconds, [row.nominal[place] for row in rows], **nominal)
+        _line(axes, seconds, [row.nominal[place] / largest[place] for row in rows], **nominal)
     axes.set_ylim(-1.1, 1.1)
-    axes.set_ylabel("action")
+    axes.set_ylabel("action, share")
     axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, fontsize=8.5)

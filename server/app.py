@@ -13,8 +13,12 @@ from starlette.types import ASGIApp
 from monitor import Monitor
 from recorder import Recorder
 from server.desk import Desk
-from server.guard import ACT, BATCH, Guard
+from server.freshness import Freshness
+from server.guard import Guard
+from server.keys import ACT, BATCH, Keys
 from server.observer import Observer, Recording
+from server.robots import RESET, robots_router
+from server.safety import Safety
 from server.schema import MAX_ROBOTS, ActReply, ActRequest, BatchReply, ModelReply
 
 MAX_BODY = 65536
@@ -24,10 +28,18 @@ MANY_FAULTS = 5
 BATCH_BODY = 16
 """The body of a batch may be so many times as large."""
 
-_ERRORS: dict[int | str, dict[str, Any]] = {
+_REFUSALS: dict[int | str, dict[str, Any]] = {
+    401: {"description": "no valid key"},
+    403: {"description": "a key for less than this"},
     413: {"description": "body too large"},
+}
+_ACT_LINKS: dict[int | str, dict[str, Any]] = {
+    200: {"links": {"reset": {"operationId": RESET, "parameters": {"name": "$request.body#/robot"}}}}
+}
+_ERRORS: dict[int | str, dict[str, Any]] = _REFUSALS | {
     422: {"description": "names the field that is wrong"},
     500: {"description": "the decision could not be told"},
+    503: {"description": "overloaded; Retry-After says when to try again"},
 }
 
 
@@ -45,9 +57,11 @@ class Lifecycle:
 def create_app(
     monitor: Monitor,
     lifecycle: Lifecycle | None = None,
-    api_key: str | None = None,
+    keys: Keys | None = None,
     max_body: int = MAX_BODY,
     recorder: Recorder | None = None,
+    safety: Safety | None = None,
+    freshness: Freshness | None = None,
     around: Callable[[ASGIApp], ASGIApp] | None = None,
 ) -> Guard:
     """The service around one monitor that is loaded and warmed up.
@@ -55,12 +69,16 @@ def create_app(
     Args:
         monitor: what decides.
         lifecycle: shared with whoever stops the service.
-        api_key: the key that every request but the health checks must carry; None asks for none.
+        keys: those that every request but the health checks must carry one of; None asks for none.
         max_body: most bytes of a request's body; a batch's may be `BATCH_BODY` times as large.
         recorder: what records the decisions, if any does.
+        safety: the limits within which it decides.
+        freshness: shared with whoever looks for silent robots; by default one within `safety.freshness`.
         around: what stands between the guard and the service, if anything does.
     """
     state = lifecycle or Lifecycle()
+    limits = safety or Safety()
+    known = freshness or Freshness(limits.freshness, monitor.faults.note)
     model = ModelReply.of(monitor)
     # No /docs: its page loads scripts from other hosts. /openapi.json is there.
     app = FastAPI(
@@ -69,7 +87,12 @@ def create_app(
 
     # These two document their paths; `Desk` answers them before FastAPI is asked, at a third of the cost, and
     # with errors that name the field without repeating the input, which may be NaN.
-    @app.post(ACT, response_model=ActReply, responses=_ERRORS, openapi_extra=_body_of(_act_schema(model)))
+    @app.post(
+        ACT,
+        response_model=ActReply,
+        responses=_ERRORS | _ACT_LINKS,
+        openapi_extra=_body_of(_act_schema(model)),
+    )
     async def act() -> None:
         raise NotImplementedError
 
@@ -98,8 +121,11 @@ def create_app(
         return JSONResponse({"status": "ready"})
 
     observers: list[Observer] = [] if recorder is None else [Recording(recorder)]
-    desk: ASGIApp = Desk(app, monitor, model, observers)
-    return Guard(desk if around is None else around(desk), api_key, max_body, {BATCH: BATCH_BODY * max_body})
+    app.include_router(robots_router(known, _REFUSALS))
+    desk: ASGIApp = Desk(app, monitor, model, observers, limits, known)
+    return Guard(
+        desk if around is None else around(desk), keys or Keys(), max_body, {BATCH: BATCH_BODY * max_body}
+    )
 
 
 def _act_schema(model: ModelReply) -> dict[str, Any]:
@@ -107,6 +133,9 @@ def _act_schema(model: ModelReply) -> dict[str, Any]:
     schema = ActRequest.model_json_schema()
     size = model.observation_size
     schema["properties"]["observation"] |= {"minItems": size, "maxItems": size}
+    # In place: a document has its definitions elsewhere, and a reply's memory is not quite a request's.
+    kinds = schema["properties"]["memory"]["anyOf"]
+    kinds[0] = schema.pop("$defs")[kinds[0]["$ref"].rpartition("/")[2]]
     return schema
 
 

@@ -13,13 +13,14 @@ from typing import Any, NamedTuple
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from server.guard import ACT, BATCH
+from server.keys import ACT, BATCH, OPEN_PATHS
 
 STREAM = "/act/stream"
 ANY_WORKER = frozenset({("POST", ACT), ("POST", BATCH), ("GET", "/model"), ("GET", "/openapi.json")})
 """What any worker answers alike: the memory travels with the robot, and all run the same bundle."""
+HEALTH = frozenset({("GET", path) for path in OPEN_PATHS})
 METRICS = "/metrics"
-ALL_WORKERS = frozenset({"/healthz", "/readyz", METRICS, "/alarms"})
+ALL_WORKERS = frozenset({"/healthz", "/readyz", METRICS, "/alarms", "/robots"})
 """What is read of all workers."""
 HTTP_OK = 200
 _ANSWER_SECONDS = 0.5
@@ -100,9 +101,7 @@ class Crew:
             elif scope["method"] == "GET" and path in ALL_WORKERS:
                 await _answer(send, await self.all(path))
             else:
-                refused = f"{scope['method']} {path} would reach one of the workers alone: not with --workers"
-                detail = [{"loc": ["path"], "msg": refused, "type": "refused"}]
-                await _answer(send, Told(501, json.dumps({"detail": detail}).encode()))
+                await _answer(send, _refusal(scope, "one of the workers alone: not with --workers"))
         elif path == STREAM:
             await self._app(scope, receive, send)
         else:
@@ -221,6 +220,30 @@ def labelled(texts: Mapping[int, str]) -> str:
     # All samples of a family stand together.
     lines = [line for family in heads for line in (*heads[family], *samples.get(family, []))]
     return "\n".join(lines) + "\n"
+
+
+class Alike:
+    """One of several replicas that know nothing of each other: answers what any of them answers alike.
+
+    Args:
+        app: the replica's own app.
+    """
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Handles one connection."""
+        if scope["type"] == "http" and (scope["method"], scope["path"]) not in ANY_WORKER | HEALTH:
+            await _answer(send, _refusal(scope, "one of the replicas alone"))
+        else:
+            await self._app(scope, receive, send)
+
+
+def _refusal(scope: Scope, whom: str) -> Told:
+    message = f"{scope['method']} {scope['path']} would reach {whom}"
+    detail = [{"loc": ["path"], "msg": message, "type": "refused"}]
+    return Told(501, json.dumps({"detail": detail}).encode())
 
 
 async def _answer(send: Send, told: Told) -> None:

@@ -1,8 +1,7 @@
-"""What stands before every request, as pure ASGI: the key, a place, and the limit on the body's size."""
+"""What stands before every request, as pure ASGI: the keys, a place, and the limit on the body's size."""
 
 from __future__ import annotations
 
-import hmac
 import json
 from collections.abc import Mapping
 from contextlib import suppress
@@ -11,13 +10,14 @@ from typing import Any
 from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-ACT, BATCH = "/act", "/act/batch"
-OPEN_PATHS = frozenset({"/healthz", "/readyz"})
-"""What an orchestrator may ask without a key."""
+from server.keys import ACT, BATCH, Keys, Level, needed
+
 AT_ONCE = "lagnet.at_once"
 """The ASGI extension by which the server takes status and body of a JSON reply at once: True if it did."""
 FULL = "lagnet.full"
 """The ASGI extension that says whether there is no place for one more robot."""
+RETRY_AFTER = (b"retry-after", b"1")
+"""Says when whoever found the service overloaded may try again [s]."""
 
 _MAX_DIGITS = 18
 
@@ -27,20 +27,20 @@ class BodyTooLargeError(ValueError):
 
 
 class Guard:
-    """Refuses requests without the key (401), without a place (503) and with a body above the limit (413).
+    """Refuses requests without a key (401), with one for less (403), without a place (503), too large (413).
 
     Args:
         app: what it guards.
-        api_key: the key that `Authorization: Bearer KEY` or `X-API-Key: KEY` must carry; None asks for none.
+        keys: those that `Authorization: Bearer KEY` or `X-API-Key: KEY` may carry.
         max_body: most bytes of a request's body.
         larger: path → most bytes of a body there, where that is more.
     """
 
     def __init__(
-        self, app: ASGIApp, api_key: str | None, max_body: int, larger: Mapping[str, int] | None = None
+        self, app: ASGIApp, keys: Keys, max_body: int, larger: Mapping[str, int] | None = None
     ) -> None:
         self._app = app
-        self._key = None if api_key is None else api_key.encode()
+        self._keys = keys
         self._max_body = max_body
         self._larger = larger or {}
 
@@ -50,8 +50,10 @@ class Guard:
             await self._app(scope, receive, send)
             return
         headers: dict[bytes, bytes] = dict(scope["headers"])
-        if scope["path"] not in OPEN_PATHS and not self._admits(headers):
-            await _refuse(send, 401, "header", "authorization", "a valid API key is required")
+        wanted = needed(scope)
+        if wanted and (granted := self._keys.granted(headers)) < wanted:
+            status, message = _not_allowed(granted, wanted)
+            await _refuse(send, status, "header", "authorization", message)
             return
         if scope["path"] in (ACT, BATCH) and scope.get("extensions", {}).get(FULL):
             await _refuse(send, 503, "connection", "limit", "every connection awaits its answer")
@@ -70,10 +72,13 @@ class Guard:
 
     def is_robots(self, scope: Mapping[str, Any]) -> bool:
         """Whether a request is one that only a robot makes: for a decision, with the key."""
-        return scope["path"] in (ACT, BATCH) and self._admits(dict(scope["headers"]))
+        return scope["path"] in (ACT, BATCH) and self._keys.granted(dict(scope["headers"])) >= Level.ACT
 
-    def _admits(self, headers: Mapping[bytes, bytes]) -> bool:
-        return self._key is None or _carries(headers, self._key)
+
+def _not_allowed(granted: Level, wanted: Level) -> tuple[int, str]:
+    if granted == Level.NOTHING:
+        return 401, "a valid API key is required"
+    return 403, f"this takes the {wanted.name.lower()} key, not the {granted.name.lower()} key"
 
 
 def _too_large(max_body: int) -> str:
@@ -96,12 +101,6 @@ def _limited(receive: Receive, max_body: int) -> Receive:
     return limited
 
 
-def _carries(headers: Mapping[bytes, bytes], key: bytes) -> bool:
-    scheme, _, bearer = headers.get(b"authorization", b"").partition(b" ")
-    given = bearer.strip() if scheme.lower() == b"bearer" else headers.get(b"x-api-key", b"")
-    return hmac.compare_digest(given, key)
-
-
 async def _refuse(send: Send, status: int, place: str, name: str, message: str) -> None:
     """Answers a request that is not read, and closes its connection."""
     detail = [{"loc": [place, name], "msg": message, "type": "refused"}]
@@ -110,7 +109,7 @@ async def _refuse(send: Send, status: int, place: str, name: str, message: str) 
     if status == 401:
         headers.append((b"www-authenticate", b"Bearer"))
     if status == 503:
-        headers.append((b"retry-after", b"1"))
+        headers.append(RETRY_AFTER)
     # The body was not read: the connection cannot carry another request.
     headers.append((b"connection", b"close"))
     await send({"type": "http.response.start", "status": status, "headers": headers})

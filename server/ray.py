@@ -14,7 +14,7 @@ import signal
 import sys
 import tempfile
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,14 +22,17 @@ from command import command, settings
 from models import BundleError
 from monitor import Monitor, MonitorError
 from server.app import MANY_FAULTS, create_app
+from server.crew import Alike
 from server.guard import Guard
-from server.serve import KEY_VARIABLE, ServeConfig, ServeError, read_api_key
+from server.keys import Keys
+from server.serve import KEY_VARIABLE, ServeConfig, ServeError, read_keys
 
 NAME = "lagnet"
 """Of the application on the cluster."""
 _HERE = frozenset(
     {
-        *("bundle", "host", "port", "gate", "threshold", "guide", "api_key_file", "max_body"),
+        *("bundle", "host", "port", "gate", "threshold", "guide", "max_body", "deadline_ms"),
+        *("api_key_file", "read_key_file", "admin_key_file", "max_in_flight", "max_in_flight_all"),
         *("margin", "position_error", "bearing_error", "travel_error", "delay_steps"),
     }
 )
@@ -73,13 +76,13 @@ class RayConfig(ServeConfig):
             raise ServeError(f"--ongoing must be above 0, got {self.ongoing}")
 
 
-def replica(files: Mapping[str, bytes], config: RayConfig, api_key: str | None) -> tuple[Monitor, Guard]:
+def replica(files: Mapping[str, bytes], config: RayConfig, keys: Keys) -> tuple[Monitor, Guard]:
     """What one replica runs: the monitor, warmed up, and the service around it.
 
     Args:
         files: name → content of the bundle's files.
         config: the settings.
-        api_key: the key that requests must carry, if any.
+        keys: those that requests must carry one of.
     """
     with tempfile.TemporaryDirectory() as folder:
         bundle = Path(folder) / config.bundle.resolve().name
@@ -87,15 +90,18 @@ def replica(files: Mapping[str, bytes], config: RayConfig, api_key: str | None) 
         for name, content in files.items():
             (bundle / name).write_bytes(content)
         monitor = Monitor.load(bundle, config.gate, config.threshold, config.filter_config(), config.guide)
-    return monitor, create_app(monitor, None, api_key, config.max_body)
+    safety = config.safety()
+    # A robot's requests come to any of the replicas.
+    safety = replace(safety, freshness=replace(safety.freshness, alone=False))
+    return monitor, create_app(monitor, None, keys, config.max_body, safety=safety, around=Alike)
 
 
-def application(config: RayConfig, api_key: str | None) -> Any:
+def application(config: RayConfig, keys: Keys) -> Any:
     """The application for `ray.serve.run`.
 
     Args:
         config: the settings.
-        api_key: the key that requests must carry, if any.
+        keys: those that requests must carry one of.
 
     Raises:
         BundleError: if the bundle must not be used; a deployment that runs is left as it is.
@@ -108,8 +114,8 @@ def application(config: RayConfig, api_key: str | None) -> Any:
     files = {path.name: path.read_bytes() for path in config.bundle.iterdir() if path.is_file()}
 
     class Replica:
-        def __init__(self, files: Mapping[str, bytes], config: RayConfig, api_key: str | None) -> None:
-            self._monitor, self._service = replica(files, config, api_key)
+        def __init__(self, files: Mapping[str, bytes], config: RayConfig, keys: Keys) -> None:
+            self._monitor, self._service = replica(files, config, keys)
 
         def __serve_build_asgi_app__(self) -> Guard:
             return self._service
@@ -130,7 +136,7 @@ def application(config: RayConfig, api_key: str | None) -> Any:
         health_check_period_s=2,
         health_check_timeout_s=10,
     )(serve.ingress()(Replica))
-    return deployment.bind(files, config, api_key)
+    return deployment.bind(files, config, keys)
 
 
 def deploy(config: RayConfig) -> dict[str, Any]:
@@ -146,13 +152,13 @@ def deploy(config: RayConfig) -> dict[str, Any]:
     from ray import serve
 
     config.check()
-    api_key = read_api_key(config.api_key_file)
-    if api_key is None and config.host not in _LOOPBACK:
+    keys = read_keys(config)
+    if not keys.any and config.host not in _LOOPBACK:
         raise ServeError(
             f"{config.host} can be reached from other machines: set {KEY_VARIABLE} or --api-key-file, "
             "or listen on 127.0.0.1"
         )
-    made = application(config, api_key)
+    made = application(config, keys)
     place = "EveryNode" if config.every_node else "HeadOnly"
     serve.start(proxy_location=place, http_options={"host": config.host, "port": config.port})
     try:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+import textwrap
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -20,7 +21,7 @@ from monitor import Monitor, MonitorError
 from recorder import RecordingError
 from recorder.reading import Reader, Recorded
 from recorder.timeline import Row, Timeline
-from server.desk import Desk
+from server.desk import UNDECIDED, Desk
 from server.schema import ModelReply
 
 DIFFERENT = 1
@@ -64,11 +65,13 @@ class Comparison:
     Attributes:
         count: how many.
         differing: how many of them differ.
+        undecided: how many more were the service's own: too late, or too old.
         shown: the first that do: what is to be said of each.
     """
 
     count: int = 0
     differing: int = 0
+    undecided: int = 0
     shown: list[str] = field(default_factory=list)
 
 
@@ -121,6 +124,9 @@ class Again:
             if robot not in wanted:
                 continue
             one, two = (told[place] if place < len(told) else {} for told in (then, now))
+            if (one.get("reason") or "").startswith(UNDECIDED):
+                self.comparison.undecided += 1
+                continue
             self.comparison.count += 1
             if differences := _differences(one, two):
                 self.comparison.differing += 1
@@ -219,10 +225,10 @@ def _draw(picture: Path, timeline: Timeline, reader: Reader, config: ReplayConfi
     from recorder.picture import draw
 
     robot = timeline.of_most_interest() if config.robot is None else config.robot
-    what = "" if reader.incident is None else f"{reader.incident['reason']} — "
-    title = f"{what[:90]}robot {robot} of {len(timeline.robots())}, {_utc(timeline.zero)}"
+    what = "" if reader.incident is None else textwrap.shorten(reader.incident["reason"], 120) + "\n"
+    title = f"{what}robot {robot}, one of {len(timeline.robots())}, {_utc(timeline.zero)}"
     try:
-        draw(picture, timeline, robot, title)
+        draw(picture, timeline, robot, title, reader.model.get("action_high", (1.0, 1.0)))
     except ImportError:
         console.print("no picture: matplotlib is not installed (pip install 'lagnet[train]')", style="yellow")
     except OSError as error:
@@ -235,6 +241,10 @@ def _told_again(again: Again, console: Console) -> bool:
     found = again.comparison
     if again.other is not None:
         console.print(again.other, style="yellow")
+    if found.undecided:
+        console.print(
+            f"{found.undecided} fallbacks are the service's own (deadline, freshness) and are not compared"
+        )
     if not found.differing:
         console.print(f"{found.count} of {found.count} decisions equal bit for bit", style="green")
         return True

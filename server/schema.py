@@ -27,6 +27,8 @@ Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Pair = Annotated[list[Finite], Field(min_length=2, max_length=2)]
 RequestNumber = Annotated[int, Field(strict=True, ge=0, lt=2**63)]
 RobotName = Annotated[str, Field(strict=True, pattern=r"^[A-Za-z0-9_.:-]{1,64}$")]
+Stamp = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0.0, le=1e10)]
+"""Seconds of a clock; a double still tells microseconds at the largest."""
 MAX_HAZARDS = 1000
 """Most hazards a request may name."""
 MAX_ROBOTS = 256
@@ -67,6 +69,8 @@ class ActRequest(BaseModel):
         request: any whole number; the reply repeats it, so that its sender knows which request it answers.
         robot: the robot's name, by which the service tells robots apart whichever way they come; at most 64
             letters, digits and "_.:-".
+        stamp: when the observation was made, by the robot's own clock, whose zero may be anywhere [s]; takes
+            `robot`. It never goes back.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -76,6 +80,7 @@ class ActRequest(BaseModel):
     memory: MemoryJson | None = None
     request: RequestNumber = 0
     robot: RobotName | None = None
+    stamp: Stamp | None = None
 
 
 class Reply(BaseModel):

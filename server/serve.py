@@ -9,10 +9,12 @@ import json
 import math
 import os
 import socket
+import ssl
 import sys
 import time
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Annotated
@@ -28,11 +30,18 @@ from recorder import Recorder, RecordingError, Settings
 from server.app import MAX_BODY, Lifecycle, create_app
 from server.crew import Crew
 from server.door import Connection, Door, Patience
+from server.freshness import Freshness, Limits
 from server.guard import Guard
+from server.keys import Keys
+from server.safety import Safety
 from server.schema import ModelReply
 
 KEY_VARIABLE = "LAGNET_API_KEY"
-"""Environment variable that may hold the key."""
+"""Environment variable that may hold the key to ask for decisions."""
+READ_KEY_VARIABLE = "LAGNET_READ_KEY"
+"""Environment variable that may hold the key to read."""
+ADMIN_KEY_VARIABLE = "LAGNET_ADMIN_KEY"
+"""Environment variable that may hold the key to change things."""
 _OTHER_FILES = 64
 """Files that are open beside the connections."""
 LEAST_FILE = 4.0
@@ -79,7 +88,29 @@ class ServeConfig:
     delay_steps: int = 0
     """How old observations are and how late actions take effect, together, in control steps."""
     api_key_file: Path | None = None
-    """File that holds the key; otherwise the environment variable LAGNET_API_KEY."""
+    """File that holds the key to ask for decisions; otherwise the environment variable LAGNET_API_KEY."""
+    read_key_file: Path | None = None
+    """File that holds the key to read alone; otherwise the environment variable LAGNET_READ_KEY."""
+    admin_key_file: Path | None = None
+    """File that holds the key to change things; otherwise the environment variable LAGNET_ADMIN_KEY."""
+    tls_cert: Path | None = None
+    """File with the certificate (PEM, with those above it): then it speaks HTTPS."""
+    tls_key: Path | None = None
+    """File with the certificate's key (PEM, no passphrase)."""
+    deadline_ms: float | None = None
+    """How long a decision may take [ms]; then the fallback is sent. Decisions then take about 0.05 ms longer.
+    By default each takes as long as it takes."""
+    max_age_ms: float | None = None
+    """How old an observation may be, by its stamp [ms]; then, and where it has no stamp or no robot's name,
+    the fallback is sent. By default only the clocks of those that are stamped are checked."""
+    hold_after_ms: float = 1e3 * Limits.hold_after
+    """For how long a robot may be without a fresh observation [ms]; then it is held until it is reset."""
+    silent_after_ms: float = 1e3 * Limits.silent_after
+    """After what time without a request a robot counts as silent [ms]."""
+    max_in_flight: int = Safety.max_in_flight
+    """Most requests of one client address that await their decisions; more are answered 503."""
+    max_in_flight_all: int = Safety.max_in_flight_all
+    """Most requests of all clients together that await their decisions."""
     max_body: int = MAX_BODY
     """Most bytes of a request's body; more is refused with 413."""
     max_connections: int = 512
@@ -118,6 +149,8 @@ class ServeConfig:
             raise ServeError(f"--port must be 0 to 65535, got {self.port}")
         if self.workers < 1:
             raise ServeError(f"--workers must be at least 1, got {self.workers}")
+        if self.workers > 1 and self.max_age_ms is not None:
+            raise ServeError("--max-age-ms: one process must follow a robot's clock, not with --workers")
         if self.max_body < 1 or self.max_connections < 1:
             raise ServeError("--max-body and --max-connections must be at least 1")
         for flag, seconds in (("--read-seconds", self.read_seconds), ("--idle-seconds", self.idle_seconds)):
@@ -125,7 +158,52 @@ class ServeConfig:
                 raise ServeError(f"{flag} must be finite and above 0, got {seconds}")
         if not (math.isfinite(self.drain_seconds) and self.drain_seconds >= 0.0):
             raise ServeError(f"--drain-seconds must be finite and at least 0, got {self.drain_seconds}")
+        self.safety()
+        self._check_tls()
         self._check_recording()
+
+    def safety(self) -> Safety:
+        """The limits within which it decides, or ServeError for one that is none."""
+        flags = (
+            ("--deadline-ms", self.deadline_ms),
+            ("--max-age-ms", self.max_age_ms),
+            ("--hold-after-ms", self.hold_after_ms),
+            ("--silent-after-ms", self.silent_after_ms),
+        )
+        for flag, limit in flags:
+            if limit is not None and not (math.isfinite(limit) and limit > 0.0):
+                raise ServeError(f"{flag} must be finite and above 0, got {limit}")
+        if self.max_in_flight < 1 or self.max_in_flight_all < 1:
+            raise ServeError("--max-in-flight and --max-in-flight-all must be at least 1")
+        return Safety(
+            deadline=None if self.deadline_ms is None else self.deadline_ms / 1e3,
+            freshness=Limits(
+                max_age=None if self.max_age_ms is None else self.max_age_ms / 1e3,
+                hold_after=self.hold_after_ms / 1e3,
+                silent_after=self.silent_after_ms / 1e3,
+            ),
+            max_in_flight=self.max_in_flight,
+            max_in_flight_all=self.max_in_flight_all,
+        )
+
+    def _check_tls(self) -> None:
+        if self.tls_cert is None and self.tls_key is None:
+            return
+        if self.tls_cert is None or self.tls_key is None:
+            raise ServeError("--tls-cert and --tls-key go together")
+        for flag, file in (("--tls-cert", self.tls_cert), ("--tls-key", self.tls_key)):
+            try:
+                file.read_bytes()
+            except OSError as error:
+                raise ServeError(f"{flag} {file} cannot be read: {error.strerror}") from error
+        try:
+            # An empty password: OpenSSL would ask the terminal for one.
+            context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+            context.load_cert_chain(self.tls_cert, self.tls_key, password="")
+        except ssl.SSLError as error:
+            why = error.reason or "they hold no PEM, or the key has a passphrase"
+            files = f"--tls-cert {self.tls_cert} and --tls-key {self.tls_key}"
+            raise ServeError(f"{files} are no certificate and its key: {why}") from error
 
     def _check_recording(self) -> None:
         sizes = (
@@ -163,6 +241,7 @@ class DrainingServer(uvicorn.Server):
         drain_seconds: how long it says so [s].
         announcement: a line for stdout, written once it listens and stops in order when told to.
         door: who may stay connected.
+        freshness: which robots it knows.
         crew: the workers that it is one of.
     """
 
@@ -173,11 +252,13 @@ class DrainingServer(uvicorn.Server):
         drain_seconds: float,
         announcement: str,
         door: Door,
+        freshness: Freshness | None = None,
         crew: Crew | None = None,
     ) -> None:
         super().__init__(config)
         self._crew = crew
         self.server_state = self._door = door
+        self._freshness = freshness
         self._lifecycle = lifecycle
         self._drain_seconds = drain_seconds
         self._announcement = announcement
@@ -187,7 +268,22 @@ class DrainingServer(uvicorn.Server):
         """Starts to listen, and says so."""
         if self._crew is not None:
             await self._crew.start()
-        await super().startup(sockets)
+        await super().startup([])
+        # uvicorn would wait a minute for a TLS handshake, in which the door sees no connection yet.
+        patience = self._door.patience.read if self.config.ssl else None
+        protocol = partial(
+            Connection, config=self.config, server_state=self._door, app_state=self.lifespan.state
+        )
+        self.servers = [
+            await asyncio.get_running_loop().create_server(
+                protocol,
+                sock=listener,
+                ssl=self.config.ssl,
+                ssl_handshake_timeout=patience,
+                backlog=self.config.backlog,
+            )
+            for listener in sockets or []
+        ]
         sys.stdout.write(self._announcement + "\n")
         sys.stdout.flush()
 
@@ -201,12 +297,14 @@ class DrainingServer(uvicorn.Server):
     async def on_tick(self, counter: int) -> bool:
         """Asked ten times a second whether to stop."""
         self._door.sweep(asyncio.get_running_loop().time())
+        if self._freshness is not None:
+            self._freshness.sweep(time.perf_counter())
         if self._stop_at is not None and time.monotonic() >= self._stop_at:
             self.should_exit = True
         return await super().on_tick(counter)
 
 
-def listen(host: str, port: int, api_key: str | None) -> socket.socket:
+def listen(host: str, port: int, keys: Keys) -> socket.socket:
     """Opens the listening socket.
 
     Raises:
@@ -216,7 +314,7 @@ def listen(host: str, port: int, api_key: str | None) -> socket.socket:
         family, kind, protocol, _, address = socket.getaddrinfo(
             host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
         )[0]
-        if api_key is None and not ipaddress.ip_address(address[0]).is_loopback:
+        if not keys.any and not ipaddress.ip_address(address[0]).is_loopback:
             raise ServeError(
                 f"{host} can be reached from other machines: set {KEY_VARIABLE} or --api-key-file, "
                 "or listen on 127.0.0.1"
@@ -231,21 +329,45 @@ def listen(host: str, port: int, api_key: str | None) -> socket.socket:
     return listener
 
 
-def read_api_key(path: Path | None) -> str | None:
-    """The key from a file, else from the environment, else None.
+def read_api_key(path: Path | None, variable: str = KEY_VARIABLE, flag: str = "--api-key-file") -> str | None:
+    """A key from a file, else from the environment, else None.
+
+    Args:
+        path: the file.
+        variable: the environment variable.
+        flag: what named the file, for the error.
 
     Raises:
         ServeError: if the file cannot be read, or the key is empty or not printable ASCII.
     """
     try:
-        key = os.environ.get(KEY_VARIABLE) if path is None else path.read_text(encoding="utf-8").strip()
+        key = os.environ.get(variable) if path is None else path.read_text(encoding="utf-8").strip()
     except (OSError, UnicodeDecodeError) as error:
-        raise ServeError(f"--api-key-file {path}: cannot be read: {error}") from error
+        raise ServeError(f"{flag} {path}: cannot be read: {error}") from error
     if key is None:
         return None
     if not key or not all("!" <= letter <= "~" for letter in key):
-        raise ServeError("the API key must be printable ASCII without spaces, and not empty")
+        named = variable if path is None else f"{flag} {path}"
+        raise ServeError(f"{named}: the API key must be printable ASCII without spaces, and not empty")
     return key
+
+
+def read_keys(config: ServeConfig) -> Keys:
+    """The keys that a service asks for.
+
+    Raises:
+        ServeError: if one cannot be had, or they do not go together.
+    """
+    try:
+        return Keys(
+            read=read_api_key(config.read_key_file, READ_KEY_VARIABLE, "--read-key-file"),
+            act=read_api_key(config.api_key_file),
+            admin=read_api_key(config.admin_key_file, ADMIN_KEY_VARIABLE, "--admin-key-file"),
+        )
+    except ServeError:
+        raise
+    except ValueError as error:
+        raise ServeError(str(error)) from error
 
 
 def allow_files(connections: int) -> None:
@@ -283,9 +405,9 @@ def serve(config: ServeConfig, crew: Crew | None = None, listener: socket.socket
         RecordingError: if it cannot be recorded.
     """
     config.check()
-    api_key = read_api_key(config.api_key_file)
+    keys = read_keys(config)
     allow_files(config.max_connections)
-    listener = listener or listen(config.host, config.port, api_key)
+    listener = listener or listen(config.host, config.port, keys)
     if config.workers > 1:
         from server.workers import supervise
 
@@ -297,18 +419,22 @@ def serve(config: ServeConfig, crew: Crew | None = None, listener: socket.socket
         )
         lifecycle = Lifecycle()
         host, port = listener.getsockname()[:2]
-        url = f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
+        scheme = "http" if config.tls_cert is None else "https"
+        url = f"{scheme}://[{host}]:{port}" if ":" in host else f"{scheme}://{host}:{port}"
         ready = {"event": "listening", "url": url, "host": host, "port": port, "model": monitor.bundle.id}
         gate = {"gate": monitor.gate.name, "threshold": monitor.gate.threshold, "guide": config.guide}
         announcement = json.dumps(ready | gate)
         with recorder_of(config, monitor) as recorder:
-            app = create_app(
-                monitor, lifecycle, api_key, config.max_body, recorder, crew.around if crew else None
-            )
+            safety = config.safety()
+            if crew is not None:
+                safety = replace(safety, freshness=replace(safety.freshness, alone=False))
+            freshness = Freshness(safety.freshness, monitor.faults.note)
+            around = None if crew is None else crew.around
+            app = create_app(monitor, lifecycle, keys, config.max_body, recorder, safety, freshness, around)
             # What is loaded stays: looking through it again and again for garbage would hold up decisions.
             gc.collect()
             gc.freeze()
-            _server(app, lifecycle, config, announcement, crew).run(sockets=[listener])
+            _server(app, lifecycle, config, announcement, freshness, crew).run(sockets=[listener])
 
 
 def recorder_of(config: ServeConfig, monitor: Monitor) -> AbstractContextManager[Recorder | None]:
@@ -324,7 +450,12 @@ def recorder_of(config: ServeConfig, monitor: Monitor) -> AbstractContextManager
 
 
 def _server(
-    app: Guard, lifecycle: Lifecycle, config: ServeConfig, announcement: str, crew: Crew | None
+    app: Guard,
+    lifecycle: Lifecycle,
+    config: ServeConfig,
+    announcement: str,
+    freshness: Freshness,
+    crew: Crew | None,
 ) -> DrainingServer:
     settings = uvicorn.Config(
         app,
@@ -336,10 +467,12 @@ def _server(
         http=Connection,
         timeout_keep_alive=math.ceil(config.idle_seconds),
         timeout_graceful_shutdown=_LAST_WORDS,
+        ssl_certfile=config.tls_cert,
+        ssl_keyfile=config.tls_key,
     )
     patience = Patience(config.read_seconds, config.idle_seconds, config.max_connections)
     door = Door(patience, app.is_robots)
-    return DrainingServer(settings, lifecycle, config.drain_seconds, announcement, door, crew)
+    return DrainingServer(settings, lifecycle, config.drain_seconds, announcement, door, freshness, crew)
 
 
 def main() -> None:

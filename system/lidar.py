@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from pointgoal.observation import BIN_WIDTH, LIDAR_BINS, LIDAR_RANGE
 from system.compiled import compiled
-from system.obstacles import FloatArray, gap
+from system.obstacles import FloatArray, put
 
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
@@ -185,19 +185,13 @@ def _cover(
         close_right = min(max(right, near_low), near_high)
         first = (b + 0.5 * (close_left + close_right)) * BIN_WIDTH
         last = (b + 0.5 * (left + right)) * BIN_WIDTH
-        out[count, 0] = start * math.cos(first)
-        out[count, 1] = start * math.sin(first)
-        out[count, 2] = end * math.cos(last) - out[count, 0]
-        out[count, 3] = end * math.sin(last) - out[count, 1]
-        if end - start < 1e-9:
-            out[count, 2] = 0.0
-            out[count, 3] = 0.0
+        x, y = start * math.cos(first), start * math.sin(first)
+        dx, dy = end * math.cos(last) - x, end * math.sin(last) - y
         shift = abs(last - first)
         bend = 0.25 * shift * (end - start) + 0.125 * end * shift * shift
-        out[count, 4] = grow + bend + start * (0.5 * (close_right - close_left) * BIN_WIDTH + spread)
+        near = grow + bend + start * (0.5 * (close_right - close_left) * BIN_WIDTH + spread)
         far = grow + bend + end * (0.5 * (right - left) * BIN_WIDTH + spread)
-        out[count, 5] = far - out[count, 4]
-        out[count, 6] = gap(out, count, 0.0, 0.0)
+        put(out, count, x, y, dx, dy, near, far - near)
         source[count] = label + b
         count += 1
     return count

@@ -3,6 +3,8 @@
 An obstacle is a row of `COLUMNS` numbers: the first centre (x, y), the way to the last centre (dx, dy), the
 radius at the first centre, its growth up to the last, and the distance of its edge from the frame's origin,
 which tells at once that most obstacles are too far to matter. All in metres, in the frame of the decision.
+Behind them stands what follows from these and is asked for again and again: the way's direction and length,
+and sine, cosine and tangent of the angle between the axis and the straight side. `put` writes such a row.
 """
 
 from __future__ import annotations
@@ -16,35 +18,46 @@ from system.compiled import compiled
 
 FloatArray = NDArray[np.float64]
 
-COLUMNS = 7
+COLUMNS = 13
 """Numbers that describe one obstacle."""
 FAR = 1e9
 """Distance where there is no obstacle [m]."""
-_BRACKET = 0.02
-"""Length to which the nearest point of a segment to a cone is bracketed [m]; errs by 0.25 mm."""
-_GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
+
+
+@compiled
+def put(
+    obstacles: FloatArray, i: int, x: float, y: float, dx: float, dy: float, radius: float, growth: float
+) -> None:
+    """Write obstacle i; a cone that one of its two discs holds whole becomes that disc. All in metres."""
+    one = obstacles[i]
+    length = math.sqrt(dx * dx + dy * dy)
+    if length < 1e-9 or abs(growth) >= length:
+        if growth > 0.0:
+            x, y, radius = x + dx, y + dy, radius + growth
+        one[:] = 0.0
+        one[0], one[1], one[4] = x, y, radius
+    else:
+        sine = growth / length
+        cosine = math.sqrt(1.0 - sine * sine)
+        one[0], one[1], one[2], one[3], one[4], one[5] = x, y, dx, dy, radius, growth
+        one[7], one[8], one[9] = dx / length, dy / length, length
+        one[10], one[11], one[12] = sine, cosine, sine / cosine
+    one[6] = gap(obstacles, i, 0.0, 0.0)
 
 
 @compiled
 def gap(obstacles: FloatArray, i: int, x: float, y: float) -> float:
     """Distance from a point to the edge of obstacle i [m]; negative inside."""
-    qx = x - obstacles[i, 0]
-    qy = y - obstacles[i, 1]
-    if obstacles[i, 2] == 0.0 and obstacles[i, 3] == 0.0:
-        return math.sqrt(qx * qx + qy * qy) - float(obstacles[i, 4] + max(obstacles[i, 5], 0.0))
-    length: float = math.sqrt(obstacles[i, 2] * obstacles[i, 2] + obstacles[i, 3] * obstacles[i, 3])
-    if length < 1e-9:
-        return math.sqrt(qx * qx + qy * qy) - float(obstacles[i, 4] + max(obstacles[i, 5], 0.0))
-    growth = obstacles[i, 5] / length
-    along = (qx * obstacles[i, 2] + qy * obstacles[i, 3]) / length
-    aside = abs(qx * obstacles[i, 3] - qy * obstacles[i, 2]) / length
-    if growth >= 1.0:
-        at = length
-    elif growth <= -1.0:
-        at = 0.0
-    else:
-        at = min(max(along + aside * growth / math.sqrt(1.0 - growth * growth), 0.0), length)
-    return math.sqrt((along - at) * (along - at) + aside * aside) - float(obstacles[i, 4] + growth * at)
+    qx, qy, length = x - obstacles[i, 0], y - obstacles[i, 1], obstacles[i, 9]
+    along = qx * obstacles[i, 7] + qy * obstacles[i, 8]
+    aside = abs(qx * obstacles[i, 8] - qy * obstacles[i, 7])
+    # The centre of the disc that is nearest.
+    at = along + aside * obstacles[i, 12]
+    if at <= 0.0 or length == 0.0:
+        return math.sqrt(qx * qx + qy * qy) - float(obstacles[i, 4])
+    if at >= length:
+        return math.sqrt((along - length) * (along - length) + aside * aside) - float(obstacles[i, 4] + obstacles[i, 5])
+    return float(aside * obstacles[i, 11] - along * obstacles[i, 10] - obstacles[i, 4])
 
 
 @compiled
@@ -55,45 +68,37 @@ def gap_segment(
 
     It need not be exact where it is above ``bound`` [m].
     """
-    dx = x1 - x0
-    dy = y1 - y0
+    dx, dy = x1 - x0, y1 - y0
+    qx, qy = x0 - obstacles[i, 0], y0 - obstacles[i, 1]
     square = dx * dx + dy * dy
     if square < 1e-12:
         return gap(obstacles, i, x0, y0)
-    if obstacles[i, 2] == 0.0 and obstacles[i, 3] == 0.0:
-        at = ((obstacles[i, 0] - x0) * dx + (obstacles[i, 1] - y0) * dy) / square
+    # Where the segment is nearest to the first centre.
+    at = -(qx * dx + qy * dy) / square
+    if obstacles[i, 9] == 0.0:
         at = min(max(at, 0.0), 1.0)
-        qx = x0 + at * dx - obstacles[i, 0]
-        qy = y0 + at * dy - obstacles[i, 1]
-        return math.sqrt(qx * qx + qy * qy) - float(obstacles[i, 4] + max(obstacles[i, 5], 0.0))
-    # A cone is convex, so the distance along the segment is a convex function: golden section search.
+        return math.sqrt((qx + at * dx) ** 2 + (qy + at * dy) ** 2) - float(obstacles[i, 4])
+    # It changes by at most the way travelled, so it may be out of the question that it gets below the bound.
     length = math.sqrt(square)
     start = gap(obstacles, i, x0, y0)
+    if start - length >= bound:
+        return start
     end = gap(obstacles, i, x1, y1)
     least = min(start, end)
-    # It changes by at most the way travelled, so it may be out of the question that it gets below the bound.
-    if 0.5 * (start + end - length) >= min(least, bound) or length < _BRACKET:
+    if 0.5 * (start + end - length) >= min(least, bound):
         return least
-    low = 0.0
-    high = 1.0
-    left = 1.0 - _GOLDEN
-    right = _GOLDEN
-    at_left = gap(obstacles, i, x0 + left * dx, y0 + left * dy)
-    at_right = gap(obstacles, i, x0 + right * dx, y0 + right * dy)
-    while (high - low) * length > _BRACKET:
-        if at_left < at_right:
-            high = right
-            right = left
-            at_right = at_left
-            left = high - _GOLDEN * (high - low)
-            at_left = gap(obstacles, i, x0 + left * dx, y0 + left * dy)
-        else:
-            low = left
-            left = right
-            at_left = at_right
-            right = low + _GOLDEN * (high - low)
-            at_right = gap(obstacles, i, x0 + right * dx, y0 + right * dy)
-    return min(least, at_left, at_right)
+    # A cone is convex, and along the segment its distance bends smoothly but where the axis is crossed. Beside
+    # the straight sides it is linear, so that it is least at an end, there, or where a centre is nearest.
+    if 0.0 < at < 1.0:
+        least = min(least, gap(obstacles, i, x0 + at * dx, y0 + at * dy))
+    at += (obstacles[i, 2] * dx + obstacles[i, 3] * dy) / square
+    if 0.0 < at < 1.0:
+        least = min(least, gap(obstacles, i, x0 + at * dx, y0 + at * dy))
+    aside, rate = qx * obstacles[i, 8] - qy * obstacles[i, 7], dx * obstacles[i, 8] - dy * obstacles[i, 7]
+    if aside * (aside + rate) < 0.0:
+        at = -aside / rate
+        least = min(least, gap(obstacles, i, x0 + at * dx, y0 + at * dy))
+    return least
 
 
 @compiled

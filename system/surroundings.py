@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from decision import PLAN_STEPS
 from system.compiled import compiled
 from system.lidar import decode, unexplained
-from system.obstacles import FloatArray, gap
+from system.obstacles import FloatArray, put
 from system.point_robot import State
 
 IntArray = NDArray[np.int64]
@@ -59,7 +59,7 @@ def surroundings(
         radius = config.hazard_radius + config.margin + config.bearing_error * distance
         # Not so for a NaN, which marks an absent hazard.
         if distance - radius <= reach:
-            out[count] = (x, y, 0.0, 0.0, radius, 0.0, distance - radius)
+            put(out, count, x, y, 0.0, 0.0, radius, 0.0)
             source[count] = i
             count += 1
     if readings.size:
@@ -71,9 +71,5 @@ def surroundings(
         for i in range(count):
             x, y = in_own_frame(out[i, 0], out[i, 1], at)
             last_x, last_y = in_own_frame(out[i, 0] + out[i, 2], out[i, 1] + out[i, 3], at)
-            out[i, :4] = (x, y, last_x - x, last_y - y)
-            if out[i, 2] * out[i, 2] + out[i, 3] * out[i, 3] < 1e-18:
-                out[i, 2:4] = 0.0
-            out[i, 4] += config.travel_error * moved
-            out[i, 6] = gap(out, i, 0.0, 0.0)
+            put(out, i, x, y, last_x - x, last_y - y, out[i, 4] + config.travel_error * moved, out[i, 5])
     return count

@@ -18,6 +18,7 @@ from filter import Robot
 from guide import DEFAULT_STRENGTH
 from monitor import Monitor
 from server.app import MANY_FAULTS, Lifecycle, create_app
+from server.keys import Keys
 from server.schema import ActReply, decision_of, reply_of
 
 
@@ -304,7 +305,7 @@ def test_a_stated_length_of_any_size_is_413(app) -> None:
 
 
 def test_the_key_is_asked_for_everywhere_but_at_the_health_checks(monitor, observation) -> None:
-    app = TestClient(create_app(monitor, api_key="secret"))
+    app = TestClient(create_app(monitor, keys=Keys(act="secret")))
     body = {"observation": observation}
     for headers in ({}, {"authorization": "Bearer wrong"}, {"authorization": "secret"}, {"x-api-key": ""}):
         assert app.post("/act", json=body, headers=headers).status_code == 401

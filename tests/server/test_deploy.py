@@ -27,6 +27,7 @@ from monitor import Monitor
 from recorder import Recorder, Settings
 from server.app import create_app
 from server.crew import Crew
+from server.keys import Keys
 from server.schema import ModelReply
 from server.serve import ServeConfig
 from tests.test_rooms import PROJECT
@@ -68,7 +69,7 @@ def test_every_way_to_start_it_has_flags_that_exist_and_a_key_beyond_loopback() 
 
 
 def test_probes_ask_what_is_answered_without_a_key(monitor: Monitor) -> None:
-    service = TestClient(create_app(monitor, api_key="sesame"))
+    service = TestClient(create_app(monitor, keys=Keys(act="sesame")))
     for probe in ("startupProbe", "readinessProbe", "livenessProbe"):
         assert service.get(CONTAINER[probe]["httpGet"]["path"]).status_code == 200
     assert service.get("/model").status_code == 401

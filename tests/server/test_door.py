@@ -23,6 +23,7 @@ from server import Client
 from server.app import MAX_BODY, Lifecycle, create_app
 from server.door import MAX_HEAD, Connection, Door, Patience
 from server.guard import Guard
+from server.keys import Keys
 from server.serve import DrainingServer, ServeConfig, ServeError, allow_files, listen, serve
 
 READ, IDLE = 0.5, 1.5
@@ -191,7 +192,7 @@ def serving(app: Guard, patience: Patience) -> Iterator[int]:
     """Runs an app behind a door, in a thread; its port."""
     settings = uvicorn.Config(app, http=Connection, ws="none", lifespan="off", log_level="error")
     server = DrainingServer(settings, Lifecycle(), 0.0, "", Door(patience, app.is_robots))
-    listener = listen("127.0.0.1", 0, None)
+    listener = listen("127.0.0.1", 0, Keys())
     thread = threading.Thread(target=server.run, args=([listener],), daemon=True)
     thread.start()
     try:
@@ -210,7 +211,7 @@ def key(request) -> str | None:
 @pytest.fixture(scope="module")
 def small(monitor, key) -> Iterator[int]:
     """The port of a service for four robots."""
-    with serving(create_app(monitor, api_key=key), Patience(robots=4)) as port:
+    with serving(create_app(monitor, keys=Keys(act=key)), Patience(robots=4)) as port:
         yield port
 
 
@@ -279,7 +280,7 @@ def test_while_every_robot_awaits_its_answer_others_are_told_to_come_back(connec
             await asyncio.sleep(0.01)
         await reply(send, b"")
 
-    with serving(Guard(slow, None, MAX_BODY), Patience(robots=2)) as port:
+    with serving(Guard(slow, Keys(), MAX_BODY), Patience(robots=2)) as port:
         try:
             waiting = [connect(port) for _ in range(2)]
             for robot in waiting:
@@ -303,7 +304,7 @@ def test_whoever_does_not_take_the_reply_is_closed_in_time(connect: Connect, req
     async def large(scope: Scope, receive: Receive, send: Send) -> None:
         await reply(send, bytes(20_000_000))
 
-    with serving(Guard(large, None, MAX_BODY), Patience(read=0.3)) as port:
+    with serving(Guard(large, Keys(), MAX_BODY), Patience(read=0.3)) as port:
         taker = connect(port)
         assert answered(taker, HEALTH).status == 200
         link = connect(port)

@@ -26,6 +26,7 @@ from evaluation.service import Service
 from models import BundleError
 from server import Client, Fleet
 from server.app import create_app
+from server.keys import Keys
 from server.ray import RayConfig, deploy
 from server.ray import replica as make_replica
 from server.serve import ServeError
@@ -43,6 +44,7 @@ def free_port() -> int:
 @pytest.mark.parametrize(
     ("settings", "named"),
     [
+        ({"max_age_ms": 100.0}, "--max-age-ms is of one process"),
         ({"workers": 2}, "--workers is of one process"),
         ({"record": Path("/tmp")}, "--record is of one process"),
         ({"drain_seconds": 2.0}, "--drain-seconds is of one process"),
@@ -61,7 +63,7 @@ def test_a_replica_answers_what_the_service_does(monitor, tiny_bundle: Path, obs
     """The bundle is that of the driver's files, whatever lies on the node."""
     files = {path.name: path.read_bytes() for path in tiny_bundle.iterdir()}
     config = RayConfig(Path("/elsewhere") / tiny_bundle.name, gate="always")
-    mine, app = make_replica(files, config, "sesame")
+    mine, app = make_replica(files, config, Keys(act="sesame"))
     service, plain = TestClient(app), TestClient(create_app(monitor))
     asked = {"observation": observation}
     assert service.post("/act", json=asked).status_code == 401
@@ -73,6 +75,15 @@ def test_a_replica_answers_what_the_service_does(monitor, tiny_bundle: Path, obs
         reply.pop("seconds")
     assert replies[0] == replies[1]
     assert mine.bundle.id == monitor.bundle.id
+    key = {"x-api-key": "sesame"}
+    assert service.get("/readyz").status_code == service.get("/model", headers=key).status_code == 200
+    refused = service.get("/robots", headers=key)
+    assert refused.status_code == 501
+    assert refused.json()["detail"][0]["msg"] == "GET /robots would reach one of the replicas alone"
+    # Another replica may have seen the robot's last stamp.
+    reply = service.post("/act", json=asked | {"robot": "one", "stamp": 1.0}, headers=key).json()
+    assert (reply["mode"], reply["opened_by"]) == ("fallback", "fault")
+    assert "follow a robot's clock" in reply["reason"]
 
 
 def test_what_cannot_be_deployed_is_one_line() -> None:

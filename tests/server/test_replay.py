@@ -296,6 +296,26 @@ def test_the_filters_settings_are_those_of_then(
     assert "20 of 20 decisions equal bit for bit" in result.stdout
 
 
+def test_what_the_monitor_was_not_asked_is_not_compared(
+    replay, tmp_path: Path, tiny_bundle: Path, monitor: Monitor, observation
+) -> None:
+    """A fallback for a stale observation: only the service of then knew how old it was."""
+    wanted = Settings(str(tmp_path), 10**9, 10**8, None, 0)
+    body = {"observation": observation, "robot": "a"}
+    with Recorder(wanted, ModelReply.of(monitor).model_dump(), {}) as recorder:
+        app = TestClient(create_app(monitor, recorder=recorder))
+        reasons = [
+            app.post("/act", json=body | {"stamp": stamp}).json()["reason"] for stamp in (2.0, 1.0, 3.0)
+        ]
+        robots = [body | {"stamp": 4.0}, body | {"stamp": 0.0}, {"observation": observation}]
+        app.post("/act/batch", json={"robots": robots})
+    assert reasons == [None, "not decided: the stamp goes back by 1 s", None]
+    result = replay(next(tmp_path.glob("*.mcap")), "--bundle", tiny_bundle)
+    assert result.returncode == 0
+    assert "4 of 4 decisions equal bit for bit" in result.stdout
+    assert "2 fallbacks are the service's own" in result.stdout
+
+
 def test_an_alarm_has_the_ring_written(tmp_path: Path, monitor: Monitor, observation) -> None:
     wanted = Settings(None, 0, 0, str(tmp_path), 10**9)
     with Recorder(wanted, ModelReply.of(monitor).model_dump(), {}) as recorder:

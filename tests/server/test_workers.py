@@ -103,11 +103,24 @@ def test_robots_drive_on_while_one_worker_after_the_other_is_killed(service: Ser
 
 
 def test_what_one_worker_alone_would_hear_is_refused(service: Service) -> None:
-    for path in ("/hold", "/model", "/alarms"):
+    for path in ("/hold", "/model", "/alarms", "/robots/one/reset"):
         status, said = get(service, path, "POST")
         assert status == 501
         assert said["detail"][0]["msg"].startswith(f"POST {path} would reach one of the workers alone")
     assert get(service, "/model")[0] == 200
+
+
+def test_what_is_stamped_is_not_decided_about(service: Service, observation: list[float]) -> None:
+    """Each worker would learn another clock, and a hold would end with the connection."""
+    body = json.dumps({"observation": observation, "robot": "one", "stamp": 1.0})
+    link = http.client.HTTPConnection(urlsplit(service.url).netloc, timeout=10.0)
+    link.request("POST", "/act", body)
+    reply = json.loads(link.getresponse().read())
+    link.close()
+    assert reply["mode"] == "fallback"
+    assert "several processes answer" in reply["reason"]
+    status, said = get(service, "/robots")
+    assert (status, [one["robots"] for one in said["each"]]) == (200, [[], []])
 
 
 def test_every_worker_gets_robots(service: Service) -> None:
@@ -205,7 +218,9 @@ def test_what_cannot_be_served_is_one_line() -> None:
     assert "no such bundle" in result.stderr
 
 
-def test_no_workers_are_refused(tiny_bundle: Path) -> None:
+def test_what_several_workers_cannot_do_is_refused(tiny_bundle: Path) -> None:
+    with pytest.raises(ServeError, match="--max-age-ms: one process must follow a robot's clock"):
+        serve(ServeConfig(tiny_bundle, workers=2, max_age_ms=100.0))
     with pytest.raises(ServeError, match="--workers must be at least 1, got 0"):
         serve(ServeConfig(tiny_bundle, workers=0))
 

@@ -1,0 +1,73 @@
+"""`GET /robots` lists the robots that the service knows; `POST /robots/{name}/reset` ends a hold."""
+
+from __future__ import annotations
+
+import time
+from typing import Annotated, Any
+
+from fastapi import APIRouter, HTTPException, Path
+from pydantic import BaseModel
+
+from server.freshness import Freshness, RobotState
+
+RESET = "reset_robot"
+"""The id of the operation that ends a hold, for links to it."""
+
+
+class RobotReply(BaseModel):
+    """What is known of one robot; see `server.freshness.Seen`.
+
+    Attributes:
+        robot: its name.
+        state: fresh, stale, held, silent.
+        reason: why it is stale or held, else null.
+        age: how old its last observation was when it came [s]; null: that cannot be told.
+        ago: when it last asked [s].
+        requests: how often it has asked.
+        late: how many of its requests in a row were late or are missing.
+    """
+
+    robot: str
+    state: RobotState
+    reason: str | None
+    age: float | None
+    ago: float
+    requests: int
+    late: int
+
+
+class RobotsReply(BaseModel):
+    """The reply of `GET /robots`.
+
+    Attributes:
+        robots: those that are known; whoever asked last comes last.
+    """
+
+    robots: list[RobotReply]
+
+
+def robots_router(freshness: Freshness, refusals: dict[int | str, dict[str, Any]]) -> APIRouter:
+    """The two paths.
+
+    Args:
+        freshness: who knows the robots.
+        refusals: the documented answers to requests without the right key.
+    """
+    router = APIRouter(responses=refusals)
+
+    @router.get("/robots")
+    async def robots() -> RobotsReply:
+        seen = freshness.robots(time.perf_counter())
+        return RobotsReply(robots=[RobotReply.model_validate(each, from_attributes=True) for each in seen])
+
+    @router.post(
+        "/robots/{name}/reset",
+        operation_id=RESET,
+        responses={404: {"description": "no robot of this name is known"}},
+    )
+    async def reset(name: Annotated[str, Path(pattern=r"^[A-Za-z0-9_.:-]{1,64}$")]) -> dict[str, str]:
+        if not freshness.reset(name):
+            raise HTTPException(404, "no robot of this name is known")
+        return {"robot": name, "state": RobotState.FRESH}
+
+    return router
