@@ -99,7 +99,7 @@ def main() -> None:
                 # A tenth of them: what Ray Serve takes for as many would be minutes.
                 requests = config.requests // 10 if name.startswith("Ray") else config.requests
                 rates = [
-                    load(generators, config.generators, url, case.body, n, max(1, requests // n))
+                    load(generators, config.generators, url, case.body, n, max(20, requests // n))
                     for n in config.clients
                 ]
                 seen.setdefault(name, []).append([*one_client(url, case, requests), *rates])
