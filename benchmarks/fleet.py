@@ -92,7 +92,7 @@ def main() -> None:
     seen: dict[str, list[list[float]]] = {}
     generators = ProcessPoolExecutor(config.generators, get_context("fork"))
     with generators, services(config) as started:
-        case = Case(cases(1)["nominal"].asked, Mode.NOMINAL)
+        case = Case(cases(1, "")["nominal"].asked, Mode.NOMINAL)
         for _ in range(config.rounds):
             for name, service in started.items():
                 url = f"{service.url}/act"

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import json
 import math
+import secrets
 import sys
 import tempfile
 import time
@@ -27,11 +28,12 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.server import Connection, cases
+from benchmarks.server import Connection, cases, full_memory
 from evaluation.service import Service
 from models import Bundle
 from monitor import GateName
 from pointgoal.observation import layout
+from server.keeper import KEY_BYTES
 
 FloatArray = NDArray[np.float64]
 
@@ -123,16 +125,20 @@ def alternate(
 
 def run(config: RecordingBenchmark) -> tuple[dict[str, dict[str, Measured]], dict[str, Any], float]:
     """What was measured by case and service; how the recorder stands at the end; bytes a decision."""
-    level = Bundle.load(config.bundle).manifest.level
+    bundle = Bundle.load(config.bundle)
+    level, key = bundle.manifest.level, secrets.token_bytes(KEY_BYTES)
     command = [sys.executable, "-m", "server.serve", str(config.bundle), "--port", "0", "--gate", config.gate]
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
+        key_file = Path(folder, "key")
+        key_file.write_bytes(key)
+        command += ["--memory-key-file", str(key_file)]
         services = {
             "without": stack.enter_context(Service.run(command)),
             "with": stack.enter_context(Service.run([*command, "--record", folder])),
         }
         measured = {
             name: alternate(services, bodies(level, case.asked), config)
-            for name, case in cases(level).items()
+            for name, case in cases(level, full_memory(bundle.id, key)).items()
         }
         time.sleep(1.0)
         with urlopen(f"{services['with'].url}/healthz") as reply:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import math
+import secrets
 import socket
 import sys
 import threading
@@ -18,6 +19,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from itertools import cycle
 from pathlib import Path
+from tempfile import NamedTemporaryFile
 from typing import Annotated, Any
 from urllib.parse import urlsplit
 
@@ -29,11 +31,12 @@ from pydantic import BaseModel
 from rich.console import Console
 from rich.table import Table
 
-from decision import PLAN_STEPS, Mode, memory_from_json
+from decision import MEMORY, PLAN_STEPS, Faults, Mode, unpack
 from evaluation.service import Service
 from monitor import GateName, Monitor
 from pointgoal.lidar import encode
 from pointgoal.observation import layout
+from server.keeper import KEY_BYTES, Keeper, Past
 from server.keys import Keys
 from server.serve import listen
 
@@ -44,7 +47,7 @@ class Echo(BaseModel):
     request: int
     observation: list[float]
     hazards: list[list[float]] | None = None
-    memory: dict[str, Any] | None = None
+    memory: str | None = None
 
 
 @dataclass(frozen=True)
@@ -140,7 +143,7 @@ class Case:
         return json.dumps(self.asked).encode()
 
 
-def cases(level: int) -> dict[str, Case]:
+def cases(level: int, memory: str) -> dict[str, Case]:
     """A robot at rest with a hazard in sight, and one that would drive into it."""
     blocks = layout(level)
     at_rest = np.zeros(blocks.size)
@@ -154,19 +157,26 @@ def cases(level: int) -> dict[str, Case]:
     if "hazards_lidar" in blocks:
         at_rest[blocks.slice("hazards_lidar")] = encode(far)[0]
         driving[blocks.slice("hazards_lidar")] = encode(near)[0]
-    plan = {"side": 5, "guided": 0, "open": 0, "plan": [[0.05, 0.5]] * PLAN_STEPS}
     plain = {"request": 1, "observation": at_rest.tolist()}
-    stop = {"request": 1, "observation": driving.tolist(), "hazards": near[0].tolist(), "memory": plan}
+    stop = {"request": 1, "observation": driving.tolist(), "hazards": near[0].tolist(), "memory": memory}
     return {
         "nominal": Case(plain, Mode.NOMINAL),
-        "nominal, a full memory": Case(plain | {"memory": plan}, Mode.NOMINAL),
+        "nominal, a full memory": Case(plain | {"memory": memory}, Mode.NOMINAL),
         "the filter acts": Case(stop, Mode.FILTERED),
     }
 
 
+def full_memory(model: str, key: bytes) -> str:
+    """A memory with a whole plan, as the service of a key sends it."""
+    memory = np.zeros(1, MEMORY)
+    memory["side"], memory["planned"], memory["left"] = 5, True, PLAN_STEPS
+    memory["plan"] = (0.05, 0.5)
+    return Keeper(key, Faults()).seal(memory[0], None, model, Past(None, None, None))
+
+
 def in_process(monitor: Monitor, asked: dict[str, Any], calls: int) -> tuple[float, float]:
     """Median and 99th percentile of a decision in this process [µs]."""
-    memory = memory_from_json(asked["memory"]) if "memory" in asked else None
+    memory = unpack(asked["memory"]) if "memory" in asked else None
     times = []
     for _ in range(calls + 50):
         started = time.perf_counter()
@@ -191,10 +201,16 @@ def over_http(url: str, case: Case, config: ServerBenchmark) -> list[float]:
 def run(config: ServerBenchmark) -> dict[str, list[float]]:
     """Starts both services, measures them in turn, stops them; the medians over rounds."""
     monitor = Monitor.load(config.bundle, config.gate)
-    measured = cases(monitor.bundle.manifest.level)
+    key = secrets.token_bytes(KEY_BYTES)
+    measured = cases(monitor.bundle.manifest.level, full_memory(monitor.bundle.id, key))
     seen: dict[str, list[list[float]]] = {}
     with ExitStack() as stack:
-        service = stack.enter_context(Service.start(config.bundle, config.gate))
+        file = stack.enter_context(NamedTemporaryFile())
+        file.write(key)
+        file.flush()
+        service = stack.enter_context(
+            Service.start(config.bundle, config.gate, None, "--memory-key-file", file.name)
+        )
         echo = stack.enter_context(Service.run([sys.executable, "-m", "benchmarks.server", "--echo"]))
         for _ in range(config.rounds):
             for name, case in measured.items():

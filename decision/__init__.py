@@ -18,12 +18,14 @@ from decision.memory import (
     SENSED,
     Memory,
     copy_of,
-    memory_from_json,
     memory_of,
-    memory_to_json,
     next_of_plan,
+    pack,
     remember_sent,
+    unpack,
 )
+from decision.parts import in_parts
+from decision.stopwatch import Stopwatch
 
 __all__ = [
     "HISTORY",
@@ -42,14 +44,16 @@ __all__ = [
     "Mode",
     "OpenedBy",
     "Origin",
+    "Stopwatch",
     "copy_of",
     "fall_back",
     "hazards_of_one",
-    "memory_from_json",
+    "in_parts",
     "memory_of",
-    "memory_to_json",
     "next_of_plan",
+    "pack",
     "remember_sent",
     "texts",
     "unknown",
+    "unpack",
 ]

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -38,8 +36,6 @@ HISTORY = np.dtype(
 - ``doubted``: 1 once a sensor that the filter steers by was caught; only a new memory trusts it again.
 """
 
-_NO_HISTORY = bytes(HISTORY.itemsize)
-
 MEMORY = np.dtype(
     [
         ("plan", "f8", (PLAN_STEPS, 2)),
@@ -49,6 +45,7 @@ MEMORY = np.dtype(
         ("guided", "i1"),
         ("planned", "?"),
         ("history", HISTORY),
+        ("seal", "i8", 4),
     ],
     align=True,
 )
@@ -61,6 +58,8 @@ MEMORY = np.dtype(
 - ``planned``: whether there is a certified plan; one without actions is to coast.
 - ``left``: how many actions of the plan are left.
 - ``history``: see `HISTORY`.
+- ``seal``: by what a service knows a memory that it sent: its number, that
+  of the first of a robot without a name, and a tag; zeros: none has.
 - ``plan``: (PLAN_STEPS, 2) what is left of the certified backup, action by action; after it the robot coasts.
 """
 
@@ -110,65 +109,24 @@ def remember_sent(memory: Memory, action: ArrayLike) -> None:
     history["age"] += history["age"] > 0
 
 
-def memory_to_json(memory: np.void) -> dict[str, Any]:
-    """One robot's memory as plain JSON, to be handed back with the next observation."""
-    left, history = int(memory["left"]), memory["history"].tobytes()
-    return {
-        "side": int(memory["side"]),
-        "guided": int(memory["guided"]),
-        "open": int(memory["open"]),
-        "history": "" if history == _NO_HISTORY else base64.b64encode(history).decode("ascii"),
-        "plan": memory["plan"][:left].tolist() if memory["planned"] else None,
-    }
+def pack(memory: bytes) -> str:
+    """One robot's memory as text, to be handed back with the next observation: base64."""
+    return base64.b64encode(memory).decode("ascii")
 
 
-def memory_from_json(value: Mapping[str, Any]) -> Memory:
-    """The inverse of `memory_to_json`: the memory (1,) of one robot.
+def unpack(text: str) -> Memory:
+    """The inverse of `pack`: the memory (1,) of one robot. What is in it is as good as whoever sent it.
 
     Raises:
-        ValueError: if the value is not a memory that this version wrote; the message names the field.
+        ValueError: if the text is not as long as a memory, or its plan is none.
     """
-    memory = np.zeros(1, MEMORY)
-    if set(value) | {"history"} != {"side", "guided", "open", "plan", "history"}:
-        raise ValueError(f"memory has the fields {sorted(value)}, expected guided, history, open, plan, side")
-    for name, least, most in (("side", -127, 127), ("guided", -1, 1), ("open", 0, MOST_OPEN)):
-        number = value[name]
-        if isinstance(number, bool) or not isinstance(number, int) or not least <= number <= most:
-            raise ValueError(f"memory.{name} must be a whole number in {least}..{most}, got {number!r}")
-        memory[name] = number
-    if value.get("history", "") != "":
-        memory["history"] = _history(value["history"])
-    if value["plan"] is None:
-        return memory
-    plan = value["plan"]
-    if not isinstance(plan, list) or len(plan) > PLAN_STEPS or not all(map(_is_action, plan)):
-        raise ValueError(f"memory.plan must be a list of at most {PLAN_STEPS} pairs of numbers in -1..1")
-    memory["planned"], memory["left"] = True, len(plan)
-    for step, action in enumerate(plan):
-        memory["plan"][0, step] = action
-    return memory
-
-
-def _history(value: object) -> np.void:
-    """The inverse of its base64, or ValueError."""
     try:
-        data = base64.b64decode(value, validate=True) if isinstance(value, str) else b""
+        data = base64.b64decode(text, validate=True)
     except ValueError:
         data = b""
-    if len(data) != HISTORY.itemsize:
-        raise ValueError(f"memory.history must be the base64 of {HISTORY.itemsize} bytes")
-    history: np.void = np.frombuffer(data, HISTORY)[0]
-    sizes = np.abs(np.frombuffer(data, np.float32, 2 * (MOST_LATE + 1) + SENSED))
-    sound = sizes.max() < np.inf and sizes[: 2 * (MOST_LATE + 1)].max() <= 1.0 and history["age"] >= 0
-    if not sound:  # NaN is neither
-        raise ValueError("memory.history has numbers that no robot is sent or sees")
-    return history
-
-
-def _is_action(pair: object) -> bool:
-    """Whether something is a list of two numbers in -1..1."""
-    return (
-        isinstance(pair, list)
-        and len(pair) == 2
-        and all(type(number) in (int, float) and abs(number) <= 1.0 for number in pair)
-    )
+    if len(data) != MEMORY.itemsize:
+        raise ValueError(f"memory must be the base64 of {MEMORY.itemsize} bytes")
+    memory: Memory = np.frombuffer(bytearray(data), MEMORY)
+    if not 0 <= memory["left"].item() <= PLAN_STEPS:
+        raise ValueError(f"memory has a plan of {memory['left'].item()} actions, not of 0 to {PLAN_STEPS}")
+    return memory

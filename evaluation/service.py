@@ -50,13 +50,19 @@ class Service:
         return self.errors.read()
 
     @staticmethod
-    def start(bundle: Path, gate: GateName, threshold: float | None = None) -> Service:
+    def start(bundle: Path, gate: GateName, threshold: float | None = None, *flags: str) -> Service:
         """Starts `lagnet-serve` on a free port of the loopback.
+
+        Args:
+            bundle: the bundle's folder.
+            gate: when the filter is active.
+            threshold: the gate's; None: the bundle's.
+            flags: further words of the command.
 
         Raises:
             ServiceError: if it ends or does not listen within three minutes (a first start compiles).
         """
-        command = [sys.executable, "-m", "server.serve", str(bundle), "--port", "0", "--gate", gate]
+        command = [sys.executable, "-m", "server.serve", str(bundle), "--port", "0", "--gate", gate, *flags]
         if threshold is not None:
             command += ["--threshold", str(threshold)]
         return Service.run(command)

@@ -125,12 +125,13 @@ def screen(
     active: BoolArray,
     certificates: Records,
     certified: BoolArray,
+    before: Records,
     memory: Records,
 ) -> int:
     """Look for certificates of the nominal actions (N, 2) where the gate is open; how many have none.
 
     Where ``active`` (N,) is False, the sure backup stands for one. ``certified`` (N,) receives which have
-    one; in ``memory`` (N,) a remembered side fades, and the plans and actions are written down.
+    one, ``memory`` (N,) what it was ``before``: but a side fades, plans and actions are written down.
     """
     config = settings[0]
     refused = 0
@@ -147,6 +148,7 @@ def screen(
             sure = seen[k].sure
             one.clearance, one.nearest = sure.clearance, sure.nearest
             one.backup, one.steps = sure.backup, sure.steps
+        memory[k] = before[k]
         past = memory[k]
         past.side -= (past.side > 0) - (past.side < 0)
         sent = past.history.sent

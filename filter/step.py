@@ -8,7 +8,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from decision import Decisions, Memory, Mode, OpenedBy, Origin, copy_of, next_of_plan, texts, unknown
+from decision import MEMORY, Decisions, Memory, Mode, OpenedBy, Origin, next_of_plan, texts, unknown
 from filter import kernel
 from filter.certificate import CERTIFICATE
 from filter.scene import DOUBT, Scene
@@ -46,19 +46,17 @@ class Step:
         self, settings: NDArray[np.void], scene: Scene, nominal: FloatArray, memory: Memory, active: BoolArray
     ) -> None:
         n = len(nominal)
-        self.settings = settings
-        self.scene = scene
+        self.settings, self.scene = settings, scene
         self.nominal = self.action = nominal
         self.active = active
-        self.certificates = np.empty(n, CERTIFICATE)
-        self.certified = np.empty(n, np.bool_)
-        self.memory, self._before = copy_of(memory), memory
+        self.certificates, self.certified = np.empty(n, CERTIFICATE), np.empty(n, np.bool_)
+        self.memory, self._before = np.empty(n, MEMORY), memory
         self._mode, self._origin = texts(Mode.NOMINAL, n), texts("", n)
         self._hazard = _nowhere(n)
         self._reason: list[str | None] = [None] * n
         # Whose plans are still to be written down.
         self._open: BoolArray | None = None
-        told = self.certificates, self.certified, self.memory
+        told = self.certificates, self.certified, memory, self.memory
         self.refused = kernel.screen(settings, scene.seen, scene.obstacles, nominal, active, *told)
 
     @cached_property

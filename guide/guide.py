@@ -65,6 +65,8 @@ class GuideConfig:
 
 
 _NOBODY, _NOTHING = np.empty(0, np.int64), np.empty((0, 2))
+_ALONE = -2
+"""In place of the hazard in the way of a robot that is not led."""
 _OWN = tuple(GuideConfig.__dataclass_fields__)
 _OF_FILTER = ("margin", "position_error", "bearing_error", "hazard_radius")
 GUIDE = np.dtype([("robot", ROBOT), *((name, "f8") for name in (*_OF_FILTER, *_OWN))], align=True)
@@ -105,9 +107,8 @@ class Guide:
         scene, memory, ahead = step.scene, step.memory, self.strength == "ahead"
         if not ahead and (self.strength == "off" or not (step.refused or memory["guided"].any())):
             return _NOBODY, _NOTHING
-        n = len(scene)
-        proposed, leads, hazard = step.nominal.copy(), np.zeros(n, np.bool_), np.empty(n, np.int64)
-        lead(
+        proposed, hazard = step.nominal.copy(), np.empty(len(scene), np.int64)
+        anyone = lead(
             self._settings,
             scene.seen,
             scene.observation,
@@ -118,10 +119,11 @@ class Guide:
             ahead,
             memory,
             proposed,
-            leads,
             hazard,
         )
-        rows = leads.nonzero()[0]
+        if not anyone:
+            return _NOBODY, _NOTHING
+        rows = (hazard != _ALONE).nonzero()[0]
         step.blame(rows, hazard[rows])
         return rows, proposed[rows]
 
@@ -188,10 +190,9 @@ def lead(
     ahead: bool,
     memory: Records,
     proposed: FloatArray,
-    leads: NDArray[np.bool_],
     hazard: IntArray,
-) -> None:
-    """Find the references of those of N robots that are led.
+) -> bool:
+    """Find the references of those of N robots that are led; whether anyone is.
 
     Args:
         settings: (1,) of `GUIDE`.
@@ -204,15 +205,16 @@ def lead(
         ahead: whether to lead whoever has something in the way, refused or not.
         memory: (N,) of `MEMORY`: the side on which a robot is being led past something is overwritten.
         proposed: (N, 2) the nominal actions u1, u2; overwritten where it leads.
-        leads: (N,) receives whether it leads.
-        hazard: (N,) receives the hazard, or n + the bin, that is in the way; -1 for none.
+        hazard: (N,) receives the hazard, or n + the bin, that is in the way of a robot that is led, -1 for
+            none; `_ALONE` of one that is not.
     """
     config = settings[0]
     _, _, first, last, goal = columns
-    size = given.shape[1] + LIDAR_BINS
+    anyone, size = False, given.shape[1] + LIDAR_BINS
     discs, source = np.empty((size, 3)), np.empty(size, dtype=np.int64)
     for k in range(len(seen)):
         past = memory[k]
+        hazard[k] = _ALONE
         if not (active[k] and (ahead or past.guided != 0 or not certified[k])):
             past.guided = 0
             continue
@@ -227,12 +229,14 @@ def lead(
             goal_x, goal_y = in_own_frame(at[1], at[2], there)
             at = (at[0], goal_x, goal_y)
         engaged = ahead or past.guided != 0
-        leads[k], led, way = _leads(
+        leads, led, way = _leads(
             config, discs, count, at, state, proposed[k], not certified[k], engaged, ahead, past.guided
         )
         past.guided = way.side if led else 0
-        hazard[k] = source[way.blocker] if way.blocker >= 0 else -1
-        if leads[k]:
+        if leads:
+            anyone = True
+            hazard[k] = source[way.blocker] if way.blocker >= 0 else -1
             thrust, turn = steer(config, discs, count, state, way.x, way.y)
             proposed[k, 0] = thrust * config.robot.force_limit
             proposed[k, 1] = turn
+    return anyone

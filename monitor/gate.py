@@ -15,7 +15,6 @@ from system.compiled import entry
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
-IntArray = NDArray[np.int16]
 
 GateName = Literal["risk", "always", "off"]
 """When the filter is active: where the risk score or the barrier asks for it, always, never."""
@@ -70,7 +69,7 @@ class Gate:
         if self.name != "risk":
             return texts(_ALWAYS if self.name == "always" else "", len(risk))
         low = low if self.floor else low & False
-        return _CAUSES[_causes(risk, low, np.ascontiguousarray(memory["open"]), self.threshold)]
+        return _CAUSES[_causes(risk, low, memory, self.threshold)]
 
     def remember(self, risk: FloatArray, low: BoolArray, changed: BoolArray, memory: Memory) -> None:
         """Write into N robots' memory how long their gates stay open; arguments as for `opened_by`.
@@ -78,30 +77,30 @@ class Gate:
         ``changed`` (N,): whether the filter sends another action than the policy's.
         """
         if self.name == "risk" and self.dwell:
-            left, low = np.array(memory["open"]), low if self.floor else low & False
-            _stay(risk, low, changed, left, self.threshold, self.threshold * self.hysteresis, self.dwell)
-            memory["open"] = left
+            low = low if self.floor else low & False
+            _stay(risk, low, changed, memory, self.threshold, self.threshold * self.hysteresis, self.dwell)
 
 
 @entry
-def _causes(risk: FloatArray, low: BoolArray, left: IntArray, opens: float) -> NDArray[np.int64]:
-    """Places in `_CAUSES` of what opens N gates with ``left`` (N,) steps to stay open."""
-    if not len(risk) == len(low) == len(left):
+def _causes(risk: FloatArray, low: BoolArray, memory: Memory, opens: float) -> NDArray[np.int64]:
+    """Places in `_CAUSES` of what opens N gates."""
+    if not len(risk) == len(low) == len(memory):
         raise ValueError("risk, low and memory must be of the same robots")
     causes = np.zeros(len(risk), np.int64)
     for k in range(len(risk)):
-        causes[k] = 3 if not risk[k] <= opens else 2 if left[k] > 0 else 1 if low[k] else 0
+        causes[k] = 3 if not risk[k] <= opens else 2 if memory[k].open > 0 else 1 if low[k] else 0
     return causes
 
 
 @entry
 def _stay(
-    risk: FloatArray, low: BoolArray, changed: BoolArray, left: IntArray, opens: float, keeps: float, n: int
+    risk: FloatArray, low: BoolArray, changed: BoolArray, memory: Memory, opens: float, keeps: float, n: int
 ) -> None:
-    """Write into ``left`` (N,) how many more steps gates stay open, n at most, see `Gate.remember`."""
-    if not len(risk) == len(low) == len(changed) == len(left):
+    """Write into N robots' memory how many more steps gates stay open, n at most, see `Gate.remember`."""
+    if not len(risk) == len(low) == len(changed) == len(memory):
         raise ValueError("risk, low, changed and memory must be of the same robots")
     for k in range(len(risk)):
-        opened = left[k] > 0 or not risk[k] <= opens or low[k]
+        left = memory[k].open
+        opened = left > 0 or not risk[k] <= opens or low[k]
         engaged = not risk[k] <= keeps or low[k] or changed[k]
-        left[k] = n if opened and engaged else max(left[k] - 1, 0)
+        memory[k].open = n if opened and engaged else max(left - 1, 0)

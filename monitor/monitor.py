@@ -20,8 +20,10 @@ from decision import (
     Mode,
     OpenedBy,
     Origin,
+    Stopwatch,
     fall_back,
     hazards_of_one,
+    in_parts,
     memory_of,
     next_of_plan,
     texts,
@@ -35,9 +37,6 @@ from monitor.errors import MonitorError
 from monitor.gate import BoolArray, Gate, GateName
 from novelty import Findings, Normal, Watch, nothing
 from pointgoal.observation import layout
-
-_NOMINAL = Mode.NOMINAL.value
-"""numpy takes ten times as long to compare with the enumeration's member."""
 
 
 class ActionFilter(Protocol):
@@ -70,6 +69,7 @@ class Monitor:
     Attributes:
         faults: what went wrong so far.
         robot: the constants of the bundle's robot.
+        stopwatch: how long "inference" and "filter" took.
 
     Raises:
         MonitorError: for an unknown gate, a threshold that is not finite and >= 0 or stands beside a whole
@@ -92,6 +92,7 @@ class Monitor:
         self.robot = _robot(bundle)
         self.guide: Strength = guide
         self.faults = Faults()
+        self.stopwatch = Stopwatch()
         if isinstance(gate, Gate) and threshold is not None:
             raise MonitorError(f"threshold must be None beside a Gate, which has its own, got {threshold}")
         wanted = manifest.threshold if threshold is None else float(threshold)
@@ -150,7 +151,12 @@ class Monitor:
 
         A bad input or any fault inside gives mode "fallback" with the reason.
         """
-        lost = None
+        return self.decide_lost(observation, hazards, memory, None)
+
+    def decide_lost(
+        self, observation: ArrayLike, hazards: ArrayLike | None, memory: Any, lost: str | None
+    ) -> Decision:
+        """`decide` for a robot whose memory is ``lost``, and why: then nothing nominal is sent."""
         try:
             past = memory_of(1, memory)
         except ValueError as error:
@@ -183,22 +189,20 @@ class Monitor:
         given = None if hazards is None else np.asarray(hazards, dtype=np.float64)
         if given is not None and (given.ndim != 3 or given.shape[::2] != (len(rows), 2)):
             raise ValueError(f"hazards must have shape [{len(rows)}, n, 2], got {given.shape}")
-        return self._decide_or_fall_back(rows, given, memory_of(len(rows), memory))
+        return in_parts(self._decide_or_fall_back, rows, given, memory_of(len(rows), memory))
 
     def _decide_or_fall_back(
         self, observation: FloatArray, hazards: FloatArray | None, memory: Memory, lost: str | None = None
     ) -> Decisions:
-        """Decides; ``lost`` says that the memory was lost, and why: then nothing nominal is sent."""
+        """Decides, whatever happens; ``lost`` as in `decide_lost`."""
         try:
             return self._decide(observation, hazards, memory, lost)
         except Exception as error:  # noqa: BLE001 - whatever it is, the robot needs an action
             if len(observation) <= 1:
                 return self.fall_back(memory, self._note(error))
-        # Something in one row spoils the batch: decide one by one, so that only its own robot gets the
-        # fallback.
+        # Something in one row spoils the batch: one by one, only its own robot gets the fallback.
         rows = [slice(i, i + 1) for i in range(len(observation))]
-        near = [None if hazards is None else hazards[i] for i in rows]
-        alone = zip((observation[i] for i in rows), near, (memory[i] for i in rows), strict=True)
+        alone = [(observation[i], None if hazards is None else hazards[i], memory[i]) for i in rows]
         return Decisions.join([self._decide_or_fall_back(*robot) for robot in alone])
 
     def fall_back(self, memory: Memory, reason: str) -> Decisions:
@@ -217,7 +221,7 @@ class Monitor:
         acts = found.any and self.gate.name != "off"
         if acts:
             scene.doubt(found.doubted)
-        nominal, risk = self._networks.run(observation)
+        nominal, risk = self.stopwatch("inference", self._networks.run, observation)
         if nominal.shape != (len(observation), 2) or risk.shape != nominal.shape[:1]:
             raise NetworkError(f"the networks gave shapes {nominal.shape} and {risk.shape}")
         sound = np.empty(len(risk), np.bool_)
@@ -233,7 +237,7 @@ class Monitor:
             ahead = ~sound & ~scene.doubted
             asked, memory = np.where(sound[:, None], nominal, planned), np.where(ahead, after, memory)
         active = opened_by != ""
-        decided = self._filter.decide(scene, asked, memory, active)
+        decided = self.stopwatch("filter", self._filter.decide, scene, asked, memory, active)
         if decided.action is not asked or decided.mode.shape != active.shape:
             decided.check(asked, active, self._low, self._high)
         if acts:
@@ -242,7 +246,7 @@ class Monitor:
             decided = self._planned(
                 decided, [lost or self._wrong(*row) for row in zip(nominal, risk, sound, strict=True)]
             )
-        self.gate.remember(risk, engaging, decided.mode != _NOMINAL, decided.memory)
+        self.gate.remember(risk, engaging, decided.changed, decided.memory)
         if self._watch is not None:
             self._watch.remember(observation, found, decided.memory)
         return decided.told(nominal, risk, self.gate.threshold, opened_by, found.novelty, found.suspect)
@@ -304,9 +308,8 @@ class Monitor:
         at_rest = np.zeros((1, blocks.size))
         at_rest[:, blocks.slice("accelerometer")] = (0.0, 0.0, 9.81)
         at_rest[:, blocks.slice("magnetometer")] = (0.0, -0.5, 0.0)
-        decision = self.decide(at_rest[0])
-        if decision.reason is not None:
-            raise MonitorError(f"{self.bundle.path}: cannot decide about a robot at rest: {decision.reason}")
+        if (why := self.decide(at_rest[0]).reason) is not None:
+            raise MonitorError(f"{self.bundle.path}: cannot decide about a robot at rest: {why}")
         asked = np.clip([[1.0, 0.0]], self._low, self._high)
         for speed, distance in product((1.0, 0.5, 0.0), (1.0, 0.7, 0.5, 0.3, 0.24, 0.22, 0.1)):
             at_rest[:, blocks.slice("velocimeter")] = (speed, 0.0, 0.0)
@@ -360,6 +363,5 @@ def _filter_config(bundle: Bundle, config: FilterConfig) -> FilterConfig:
 def _check_layout(bundle: Bundle) -> None:
     stated = [block.model_dump() for block in bundle.manifest.observation_layout]
     if stated != layout(bundle.manifest.level).to_json():
-        raise MonitorError(
-            f"{bundle.path}: its observation layout is not that of level {bundle.manifest.level} of the task"
-        )
+        level = bundle.manifest.level
+        raise MonitorError(f"{bundle.path}: its observation layout is not that of level {level} of the task")

@@ -6,22 +6,21 @@ import io
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from decision import Memory
+from novelty import consistency
 from novelty.consistency import (
+    FOUND,
     GROUPS,
     count_of_numbers,
     groups_of_numbers,
-    measure,
     numbers_of,
-    remember,
-    weigh,
+    tables_for,
 )
-from system.point_robot import ROBOT, Robot
+from system.point_robot import Robot
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -90,23 +89,33 @@ class Normal:
         return Normal(**found)
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False, slots=True)
 class Findings:
     """What is to be said of N observations.
 
     Attributes:
+        found: (N,) of `consistency.FOUND`.
         novelty: (N,) the largest distance in parts of its limit.
         suspect: (N,) the sensors' names where it is above 1, else "".
-        doubted: (N,) whether a sensor that the filter steers by is not trusted.
         any: whether one is doubted, or suspect.
-        off: (N, 3, 7) the distances.
     """
 
+    found: NDArray[np.void]
     novelty: FloatArray
     suspect: NDArray[np.str_]
-    doubted: BoolArray
     any: bool
-    off: FloatArray
+
+    @property
+    def doubted(self) -> BoolArray:
+        """(N,) whether a sensor that the filter steers by is not trusted."""
+        doubted: BoolArray = self.found["doubted"]
+        return doubted
+
+    @property
+    def off(self) -> FloatArray:
+        """(N, 3, 7) the distances."""
+        off: FloatArray = self.found["off"]
+        return off
 
 
 class Watch:
@@ -116,33 +125,33 @@ class Watch:
         normal: what is.
         robot: the robot's constants.
         delay_steps: control steps until an action takes effect, as the filter has them.
+
+    Raises:
+        ValueError: if the precision of what is normal is none.
     """
 
     def __init__(self, normal: Normal, robot: Robot, delay_steps: int = 0) -> None:
         self.normal = normal
-        self._robot = np.array([tuple(robot)], ROBOT)
-        self._delay = delay_steps
-        self._tables = _tables(normal)
+        self._tables = _tables(normal, robot, delay_steps)
 
     def look(self, observation: FloatArray, memory: Memory) -> Findings:
         """What is to be said of N observations (N, O), which are finite, given the robots' memory (N,)."""
         n = len(observation)
-        off = np.empty((n, KINDS, 7))
-        measure(self._robot, self._delay, observation, memory, self.normal.least, self._tables, off)
-        novelty, which, doubted = np.empty(n), np.empty(n, np.int64), np.empty(n, np.bool_)
-        any_of_them = weigh(off, self.normal.limits, memory, novelty, which, doubted)
-        suspect = np.where(novelty > 1.0, _NAMES[which], "") if any_of_them else _nobody(n)
-        return Findings(novelty, suspect, doubted, any_of_them, off)
+        found = np.empty(n, FOUND)
+        any_of_them = consistency.look(self._tables, observation, memory, found)
+        novelty = found["novelty"]
+        suspect = np.where(novelty > 1.0, _NAMES[found["suspect"]], "") if any_of_them else _nobody(n)
+        return Findings(found, novelty, suspect, any_of_them)
 
     def remember(self, observation: FloatArray, findings: Findings, memory: Memory) -> None:
         """Write into N robots' memory what was seen, and what is not trusted."""
-        remember(observation, findings.doubted, memory)
+        consistency.remember(observation, findings.found, memory)
 
 
 @lru_cache(maxsize=64)
 def nothing(n: int) -> Findings:
     """What is to be said of N observations that nobody looks at."""
-    return Findings(np.full(n, np.nan), _nobody(n), np.zeros(n, np.bool_), False, np.empty((n, KINDS, 7)))
+    return Findings(np.zeros(n, FOUND), np.full(n, np.nan), _nobody(n), False)
 
 
 def learn(observation: FloatArray) -> Normal:
@@ -173,11 +182,20 @@ def _nobody(n: int) -> NDArray[np.str_]:
     return np.full(n, "", dtype="<U13")
 
 
-def _tables(normal: Normal) -> tuple[FloatArray, FloatArray, Any, Any, FloatArray]:
-    """What `consistency.surprise` takes."""
+def _tables(normal: Normal, robot: Robot, delay_steps: int) -> NDArray[np.void]:
+    """What `consistency.look` takes (1,)."""
     order, bounds = groups_of_numbers(len(normal.mean))
-    inverse = np.zeros_like(normal.precision)
+    apart = np.empty_like(normal.precision)
     for first, last in pairwise(bounds.tolist()):
         block = order[first:last]
-        inverse[first:last, first:last] = np.linalg.inv(normal.precision[np.ix_(block, block)])
-    return normal.mean, normal.precision, order, bounds, inverse
+        try:
+            lower = np.linalg.cholesky(normal.precision[np.ix_(block, block)])
+        except np.linalg.LinAlgError as error:
+            raise ValueError("precision must be positive definite") from error
+        apart[first:last] = np.linalg.solve(lower, normal.precision[block])
+    tables = np.zeros(1, tables_for(len(normal.mean)))
+    tables["robot"], tables["delay"], tables["bounds"] = tuple(robot), delay_steps, bounds
+    tables["least"], tables["limits"] = normal.least, normal.limits
+    # Column by column: compiled code adds one to another.
+    tables["mean"], tables["apart"] = normal.mean, apart.T
+    return tables

@@ -135,7 +135,7 @@ class Scribe:
                 told = {"robot": robot} | {
                     name: answer[name] for name in _TOLD if answer.get(name) is not None
                 }
-                told["plan_left"] = len(answer["memory"]["plan"] or ())
+                told["plan_left"] = len(answer["plan"])
             if told.get("mode", "fallback") == "fallback":
                 incident = incident or f"robot {robot}: {told.get('reason') or 'fallback'}"
             if question:

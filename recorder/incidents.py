@@ -40,6 +40,11 @@ class Ring:
         while self._kept and (self._size > self._most or now - self._kept[0][0] > RING_SECONDS):
             self._size -= self._kept.popleft()[1].size
 
+    def clear(self) -> None:
+        """Lets go of everything."""
+        self._kept.clear()
+        self._size = 0
+
     def exchanges(self, now: float) -> list[Exchange]:
         """What is kept of the last `RING_SECONDS`, in order."""
         return [exchange for at, exchange in self._kept if now - at <= RING_SECONDS]
@@ -117,6 +122,18 @@ class Incidents:
         tape.flush()
         self._tape = tape
         self.count, self.last = self.count + 1, tape.path.name
+
+    def change(self, about: About, at: int) -> None:
+        """Another one decides: what is kept of the one before is written, and nothing of it is kept.
+
+        Args:
+            about: what decides now.
+            at: when [ns since 1970].
+        """
+        self.happened("another bundle took over", at)
+        self.close()
+        self._ring.clear()
+        self._about, self._until = about, -math.inf
 
     def flush_if_due(self) -> None:
         """Writes what has waited for long enough, and ends the file of an incident that is over."""

@@ -4,8 +4,8 @@ It reads from its standard input what the service hands on, writes the files, an
 how it stands. That it is another process keeps the work off the service's interpreter, and lets the files be
 ended in order when the service is killed.
 
-The frames are: the settings; then lists of exchanges and, as texts, of causes for a file of an incident; None
-before an orderly end.
+The frames are: the settings; then lists of exchanges, of causes for a file of an incident, as texts, and of
+what decides from then on, as objects; None before an orderly end.
 """
 
 from __future__ import annotations
@@ -60,6 +60,8 @@ class Process:
         for item in batch:
             if isinstance(item, str):
                 self._incident(item, time.time_ns())
+            elif isinstance(item, dict):
+                self._change(item)
             else:
                 self._exchange(Exchange(*item))
         if self._recording is not None:
@@ -99,6 +101,15 @@ class Process:
             self._trying("incidents", lambda: incidents.add(exchange, entries))
         if incident is not None:
             self._incident(incident, exchange.received)
+
+    def _change(self, about: dict[str, Any]) -> None:
+        """Another one decides: no file holds the decisions of both."""
+        if self._recording is not None:
+            recording = self._recording
+            self._trying("recording", lambda: recording.change(about))
+        if self._incidents is not None:
+            incidents = self._incidents
+            self._trying("incidents", lambda: incidents.change(about, time.time_ns()))
 
     def _incident(self, why: str, at: int) -> None:
         if self._incidents is not None:

@@ -71,16 +71,14 @@ class Recorder:
         self.dropped = 0
         self._stopped: dict[str, str] = {}
         self._status: dict[str, Any] = {}
-        self._waiting: deque[tuple[Any, ...] | str] = deque()
+        self._waiting: deque[tuple[Any, ...] | str | dict[str, Any]] = deque()
         # Each of the two is written by one thread.
         self._taken = self._handed = 0
         self._number = 0
         self._gone = False
         self._closing, self._ready = Event(), Event()
         self._failed: str | None = None
-        release = version("lagnet")
-        text = {"version": release, "model": json.dumps(model), "filter": json.dumps(filter_config)}
-        about = {"version": release, "text": text, "layout": list(model["observation_layout"])}
+        self._filter_config = filter_config
         # What it says besides goes where the service's own complaints go.
         command = [sys.executable, "-m", "recorder.process"]
         self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
@@ -89,7 +87,7 @@ class Recorder:
         _widen(self._pipe)
         self._listener = Thread(target=self._listen, name="recorder listens", daemon=True)
         self._listener.start()
-        self._send(asdict(settings) | {"about": about})
+        self._send(asdict(settings) | {"about": self._about(model)})
         if not self._ready.wait(_START_SECONDS) or self._failed is not None or self._gone:
             self._process.kill()
             self._process.wait()
@@ -137,6 +135,14 @@ class Recorder:
         """
         self._waiting.append(why)
 
+    def change(self, model: Mapping[str, Any]) -> None:
+        """Another one decides from now on: what follows has files of its own; from the thread of `record`.
+
+        Args:
+            model: what decides, as `GET /model` tells it; with the same observation layout and filter.
+        """
+        self._waiting.append(self._about(model))
+
     def close(self) -> None:
         """Ends the recording: what was recorded up to now is written."""
         self._closing.set()
@@ -168,7 +174,7 @@ class Recorder:
             while self._waiting:
                 item = self._waiting.popleft()
                 batch.append(item)
-                size += 0 if isinstance(item, str) else len(item[-1]) + len(item[-2])
+                size += len(item[-1]) + len(item[-2]) if isinstance(item, tuple) else 0
             # An empty one as well: the other side has no clock of its own.
             self._send(batch)
             self._handed += size
@@ -181,6 +187,12 @@ class Recorder:
         self._waiting.clear()
         with suppress(OSError):
             self._pipe.close()
+
+    def _about(self, model: Mapping[str, Any]) -> dict[str, Any]:
+        """What is written into each file of what decided."""
+        release = version("lagnet")
+        text = {"version": release, "model": json.dumps(model), "filter": json.dumps(self._filter_config)}
+        return {"version": release, "text": text, "layout": list(model["observation_layout"])}
 
     def _send(self, value: Any) -> None:
         try:

@@ -198,6 +198,11 @@ class Recording:
         if self._tape is not None:
             self._tape.flush_if_due()
 
+    def change(self, about: About) -> None:
+        """Another one decides: the next file says so."""
+        self.close()
+        self._about = about
+
     def close(self) -> None:
         """Ends the file."""
         if self._tape is not None:

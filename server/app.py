@@ -1,7 +1,8 @@
-"""The HTTP service: `POST /act`, `POST /act/batch`, `/model`, `/healthz`, `/readyz`."""
+"""The HTTP service: decisions, what tells of itself, health checks, and what an operator asks and says."""
 
 from __future__ import annotations
 
+import secrets
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -12,19 +13,22 @@ from starlette.types import ASGIApp
 
 from monitor import Monitor
 from recorder import Recorder
+from server.change import Changer
+from server.console import add_console
 from server.desk import Desk
 from server.freshness import Freshness
 from server.guard import Guard
+from server.keeper import KEY_BYTES, Keeper
 from server.keys import ACT, BATCH, Keys
 from server.observer import Observer, Recording
+from server.operation import Operation
 from server.robots import RESET, robots_router
 from server.safety import Safety
 from server.schema import MAX_ROBOTS, ActReply, ActRequest, BatchReply, ModelReply
+from server.states import NOT_READY, State
 
 MAX_BODY = 65536
 """Most bytes of a request's body: 60 numbers and a thousand hazards fit."""
-MANY_FAULTS = 5
-"""Internal faults within a minute from which on the service is not ready: a robot may live with one."""
 BATCH_BODY = 16
 """The body of a batch may be so many times as large."""
 
@@ -60,8 +64,11 @@ def create_app(
     keys: Keys | None = None,
     max_body: int = MAX_BODY,
     recorder: Recorder | None = None,
+    operation: Operation | None = None,
+    changer: Changer | None = None,
     safety: Safety | None = None,
     freshness: Freshness | None = None,
+    memory_key: bytes | None = None,
     around: Callable[[ASGIApp], ASGIApp] | None = None,
 ) -> Guard:
     """The service around one monitor that is loaded and warmed up.
@@ -72,14 +79,19 @@ def create_app(
         keys: those that every request but the health checks must carry one of; None asks for none.
         max_body: most bytes of a request's body; a batch's may be `BATCH_BODY` times as large.
         recorder: what records the decisions, if any does.
+        operation: what an operator sees and says; by default one with the usual alarms.
+        changer: changes the bundle; None: nobody does.
         safety: the limits within which it decides.
         freshness: shared with whoever looks for silent robots; by default one within `safety.freshness`.
+        memory_key: seals the robots' memories, see `Keeper`; None: one made at random.
         around: what stands between the guard and the service, if anything does.
     """
     state = lifecycle or Lifecycle()
     limits = safety or Safety()
     known = freshness or Freshness(limits.freshness, monitor.faults.note)
-    model = ModelReply.of(monitor)
+    watched = operation or Operation(monitor, recorder)
+    duty = watched.duty
+    model = duty.now.model
     # No /docs: its page loads scripts from other hosts. /openapi.json is there.
     app = FastAPI(
         title="Lagnet", description="What a watched robot policy does next.", docs_url=None, redoc_url=None
@@ -104,28 +116,33 @@ def create_app(
 
     @app.get("/model", response_model=ModelReply)
     async def about() -> ModelReply:
-        return model
+        return duty.now.model
 
     @app.get("/healthz")
     async def healthz() -> dict[str, Any]:
         # A service that can no longer record is alive, and says so.
-        return {"status": "alive"} | ({} if recorder is None else {"recording": recorder.status()})
+        told = {"status": "alive", "state": watched.states.state}
+        return told | ({} if recorder is None else {"recording": recorder.status()})
 
-    @app.get("/readyz", responses={503: {"description": "draining, or degraded by its own faults"}})
+    @app.get("/readyz", responses={503: {"description": "starting, degraded, draining or stopped"}})
     async def readyz() -> JSONResponse:
         if state.draining:
-            return JSONResponse({"status": "draining"}, status_code=503)
-        faults = monitor.faults.internal()
-        if faults >= MANY_FAULTS:
-            return JSONResponse({"status": "degraded", "internal_faults": faults}, status_code=503)
-        return JSONResponse({"status": "ready"})
+            watched.drain()
+        status = watched.tick()
+        told = {"why": watched.states.why} if status in (State.DEGRADED, State.HOLD) else {}
+        return JSONResponse({"status": status} | told, 503 if status in NOT_READY else 200)
 
-    observers: list[Observer] = [] if recorder is None else [Recording(recorder)]
-    app.include_router(robots_router(known, _REFUSALS))
-    desk: ASGIApp = Desk(app, monitor, model, observers, limits, known)
-    return Guard(
+    observers: list[Observer] = [watched.tally]
+    if recorder is not None:
+        observers.append(Recording(recorder, model))
+    keeper = Keeper(memory_key or secrets.token_bytes(KEY_BYTES), monitor.faults)
+    app.include_router(robots_router(known, keeper, _REFUSALS))
+    desk: ASGIApp = Desk(app, duty, keeper, observers, limits, known)
+    guard = Guard(
         desk if around is None else around(desk), keys or Keys(), max_body, {BATCH: BATCH_BODY * max_body}
     )
+    add_console(app, watched, changer, guard.refusals)
+    return guard
 
 
 def _act_schema(model: ModelReply) -> dict[str, Any]:
@@ -133,9 +150,6 @@ def _act_schema(model: ModelReply) -> dict[str, Any]:
     schema = ActRequest.model_json_schema()
     size = model.observation_size
     schema["properties"]["observation"] |= {"minItems": size, "maxItems": size}
-    # In place: a document has its definitions elsewhere, and a reply's memory is not quite a request's.
-    kinds = schema["properties"]["memory"]["anyOf"]
-    kinds[0] = schema.pop("$defs")[kinds[0]["$ref"].rpartition("/")[2]]
     return schema
 
 

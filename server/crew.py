@@ -126,9 +126,13 @@ class Crew:
         return Told(HTTP_OK, (labelled(texts) + self._metrics()).encode(), worst.kind)
 
     def _summed(self, told: Mapping[int, Told], worst: Told) -> dict[str, Any]:
-        each = [{"worker": number} | json.loads(answer.body) for number, answer in told.items()]
+        answers = [(number, json.loads(answer.body)) for number, answer in told.items()]
+        each = [
+            {"worker": number} | (said if isinstance(said, dict) else {"list": said})
+            for number, said in answers
+        ]
         said = json.loads(worst.body)
-        about = {"status": said["status"]} if "status" in said else {}
+        about = {"status": said["status"]} if isinstance(said, dict) and "status" in said else {}
         return about | asdict(self.roster) | {"each": each}
 
     def _metrics(self) -> str:

@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, cast
+from typing import Any, Protocol, cast
 
 import httptools
 from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol, RequestResponseCycle
@@ -47,6 +47,23 @@ class Patience:
     robots: int = 512
 
 
+class Caller(Protocol):
+    """An open connection, whatever is spoken over it.
+
+    Attributes:
+        deadline: when it is closed, on the event loop's clock [s].
+    """
+
+    deadline: float
+
+    @property
+    def awaits_answer(self) -> bool:
+        """Whether it is not its turn to speak."""
+
+    def turn_away(self) -> None:
+        """Closes it."""
+
+
 class Door(ServerState):
     """The open connections of one service.
 
@@ -63,15 +80,15 @@ class Door(ServerState):
         self.patience = patience
         self._is_robots = is_robots
         # Both in order: whoever came, or was answered, longest ago is first.
-        self._newcomers: dict[Connection, None] = {}
-        self._robots: dict[Connection, None] = {}
+        self._newcomers: dict[Caller, None] = {}
+        self._robots: dict[Caller, None] = {}
 
-    def enter(self, connection: Connection) -> None:
+    def enter(self, connection: Caller) -> None:
         """Lets a new connection in; the oldest newcomer makes room."""
         _make_room(self._newcomers, self.patience.robots)
         self._newcomers[connection] = None
 
-    def heard(self, connection: Connection, scope: Mapping[str, Any]) -> None:
+    def heard(self, connection: Caller, scope: Mapping[str, Any]) -> None:
         """A whole request has come."""
         robot = connection in self._robots
         self.leave(connection)
@@ -81,7 +98,7 @@ class Door(ServerState):
         else:
             self._newcomers[connection] = None
 
-    def full(self, connection: Connection) -> bool:
+    def full(self, connection: Caller) -> bool:
         """Whether there is no room for one more robot: all of them await their answers."""
         return (
             len(self._robots) >= self.patience.robots
@@ -89,7 +106,7 @@ class Door(ServerState):
             and _longest_idle(self._robots) is None
         )
 
-    def leave(self, connection: Connection) -> None:
+    def leave(self, connection: Caller) -> None:
         """A connection is closed."""
         self._newcomers.pop(connection, None)
         self._robots.pop(connection, None)
@@ -100,7 +117,7 @@ class Door(ServerState):
         Args:
             now: on the event loop's clock [s].
         """
-        for connection in cast(set[Connection], self.connections).copy():
+        for connection in cast(set[Caller], self.connections).copy():
             if connection.deadline < now:
                 connection.turn_away()
 
@@ -160,8 +177,15 @@ class Connection(HttpToolsProtocol):
         extensions: dict[str, Any] = {AT_ONCE: partial(self._at_once, self.cycle)}
         self.scope["extensions"] = extensions | {FULL: self._door.full(self)}
 
+    def handle_websocket_upgrade(self) -> None:
+        """It goes on as a stream."""
+        self._door.leave(self)
+        super().handle_websocket_upgrade()
+
     def on_message_complete(self) -> None:
         """The request has come whole: from here on it is we who are slow."""
+        if self.parser.should_upgrade() and self._should_upgrade():
+            return
         self._reading = False
         self._allow(math.inf)
         self._door.heard(self, self.scope)
@@ -229,11 +253,11 @@ class Connection(HttpToolsProtocol):
         return cast(Door, self.server_state)
 
 
-def _longest_idle(connections: dict[Connection, None]) -> Connection | None:
+def _longest_idle(connections: dict[Caller, None]) -> Caller | None:
     return next((connection for connection in connections if not connection.awaits_answer), None)
 
 
-def _make_room(connections: dict[Connection, None], most: int) -> None:
+def _make_room(connections: dict[Caller, None], most: int) -> None:
     """Makes room for one more, if one of them can go."""
     if len(connections) >= most and (idle := _longest_idle(connections)) is not None:
         del connections[idle]

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from decision import MEMORY, Decision, Decisions, Faults, Memory
 from server.client import DEFAULT_TIMEOUT, Client
 from server.schema import ModelReply
+from server.session import MOST_FAILURES
 
 FloatArray = NDArray[np.float64]
 
@@ -26,10 +27,11 @@ class Fleet:
     """A client for each of several robots, with the `decide` and `decide_batch` of `monitor.Monitor`.
 
     Args:
-        url: the service.
+        url: the service, or several, see `Client`.
         observation_layout: what the robots send, see `Client`.
         timeout: how long a robot waits for its action [s].
         api_key: the service's key, if it asks for one.
+        most_failures: a robot's failures in a row after which it holds until `resume`; None: never.
 
     Attributes:
         faults: what went wrong so far, over all robots.
@@ -41,12 +43,13 @@ class Fleet:
 
     def __init__(
         self,
-        url: str,
+        url: str | Sequence[str],
         observation_layout: Sequence[Mapping[str, Any]] | None = None,
         timeout: float = DEFAULT_TIMEOUT,
         api_key: str | None = None,
+        most_failures: int | None = MOST_FAILURES,
     ) -> None:
-        self._service = (url, observation_layout, timeout, api_key)
+        self._service = (url, observation_layout, timeout, api_key, None, most_failures)
         self._clients: list[Client] = []
         self._open = ExitStack()
         self.faults = Faults("lagnet.client")
@@ -106,6 +109,16 @@ class Fleet:
 
         list(self._senders.map(ask_some, range(_SENDERS)))
         return Decisions.of([decision for decision in decided if decision is not None])
+
+    def resume(self) -> None:
+        """Ends the holds, see `Client.resume`.
+
+        Raises:
+            ClientError: if a robot cannot connect.
+        """
+        for client in self._clients:
+            if client.held is not None:
+                client.resume()
 
     def close(self) -> None:
         """Closes the connections."""

@@ -16,6 +16,8 @@ MANY_LATE = 5
 """Late or missing requests in a row from which on they are noted."""
 _JUMP = 0.5
 """By how much a clock may jump where no age is asked for [s]."""
+_GONE = 60.0
+"""A robot that was silent for so long has left, and is no longer missed [s]."""
 _USUAL = 0.1
 """Weight of the newest gap between two requests in the usual one."""
 
@@ -217,6 +219,16 @@ class Freshness:
             self.note("silent robot", f"{name}: silent for {now - known.seen:.1f} s")
         return [name for name, _ in fallen]
 
+    def unwell(self, now: float) -> list[str]:
+        """The robots that are stale, held, late again and again, or silent for less than a minute."""
+        with self._lock:
+            return [
+                name
+                for name, known in self._robots.items()
+                if known.held is not None
+                or (now - known.seen < _GONE and (known.reason is not None or self._is_late(known, now)))
+            ]
+
     def reset(self, robot: str) -> bool:
         """Ends a robot's hold; its clock is learned anew. False if it is not known."""
         with self._lock:
@@ -244,6 +256,9 @@ class Freshness:
                 )
                 for name, known in self._robots.items()
             ]
+
+    def _is_late(self, known: _Robot, now: float) -> bool:
+        return now - known.seen > self.limits.silent_after or known.in_a_row(now) >= MANY_LATE
 
     def _state(self, known: _Robot, now: float) -> RobotState:
         if known.held is not None:

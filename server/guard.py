@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Mapping
 from contextlib import suppress
 from typing import Any
@@ -10,8 +11,10 @@ from typing import Any
 from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from server.keys import ACT, BATCH, Keys, Level, needed
+from server.keys import ACT, BATCH, HOLD, MODEL, RESUME, STREAM, Keys, Level, needed
 
+ADMIN_PATHS = frozenset({MODEL, HOLD, RESUME})
+"""Whoever posts there needs the admin key. Where there is none it is refused: any page in a browser could."""
 AT_ONCE = "lagnet.at_once"
 """The ASGI extension by which the server takes status and body of a JSON reply at once: True if it did."""
 FULL = "lagnet.full"
@@ -19,6 +22,8 @@ FULL = "lagnet.full"
 RETRY_AFTER = (b"retry-after", b"1")
 """Says when whoever found the service overloaded may try again [s]."""
 
+_HANDSHAKE = "websocket.http.response"
+"""What messages are called that answer a WebSocket's handshake with a reply."""
 _MAX_DIGITS = 18
 
 
@@ -34,11 +39,15 @@ class Guard:
         keys: those that `Authorization: Bearer KEY` or `X-API-Key: KEY` may carry.
         max_body: most bytes of a request's body.
         larger: path → most bytes of a body there, where that is more.
+
+    Attributes:
+        refusals: status → requests refused here.
     """
 
     def __init__(
         self, app: ASGIApp, keys: Keys, max_body: int, larger: Mapping[str, int] | None = None
     ) -> None:
+        self.refusals: Counter[int] = Counter()
         self._app = app
         self._keys = keys
         self._max_body = max_body
@@ -46,23 +55,26 @@ class Guard:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Handles one connection."""
-        if scope["type"] != "http":
-            await self._app(scope, receive, send)
-            return
         headers: dict[bytes, bytes] = dict(scope["headers"])
+        if scope["type"] == "websocket":
+            await self._stream(headers, scope, receive, send)
+            return
         wanted = needed(scope)
         if wanted and (granted := self._keys.granted(headers)) < wanted:
             status, message = _not_allowed(granted, wanted)
-            await _refuse(send, status, "header", "authorization", message)
+            await self._refuse(send, status, "header", "authorization", message)
+            return
+        if scope["path"] in ADMIN_PATHS and scope["method"] == "POST" and self._keys.admin is None:
+            await self._refuse(send, 403, "header", "authorization", "the service has no admin key")
             return
         if scope["path"] in (ACT, BATCH) and scope.get("extensions", {}).get(FULL):
-            await _refuse(send, 503, "connection", "limit", "every connection awaits its answer")
+            await self._refuse(send, 503, "connection", "limit", "every connection awaits its answer")
             return
         max_body = self._larger.get(scope["path"], self._max_body)
         stated = headers.get(b"content-length", b"")
         # int() refuses thousands of digits.
         if stated.isdigit() and (len(stated) > _MAX_DIGITS or int(stated) > max_body):
-            await _refuse(send, 413, "body", "content-length", _too_large(max_body))
+            await self._refuse(send, 413, "body", "content-length", _too_large(max_body))
             return
         if not stated.isdigit() or b"transfer-encoding" in headers:
             receive = _limited(receive, max_body)
@@ -70,9 +82,33 @@ class Guard:
         with suppress(ClientDisconnect):
             await self._app(scope, receive, send)
 
+    async def _stream(
+        self, headers: Mapping[bytes, bytes], scope: Scope, receive: Receive, send: Send
+    ) -> None:
+        if scope["path"] != STREAM:
+            message = f"the stream is at {STREAM}"
+            await self._refuse(send, 404, "path", scope["path"], message, _HANDSHAKE)
+        elif (granted := self._keys.granted(headers)) < Level.ACT:
+            status, message = _not_allowed(granted, Level.ACT)
+            await self._refuse(send, status, "header", "authorization", message, _HANDSHAKE)
+        elif b"origin" in headers:
+            # Browsers let any page open a stream to any host, and say whose page it is.
+            message = "the stream is not for browsers"
+            await self._refuse(send, 403, "header", "origin", message, _HANDSHAKE)
+        else:
+            await self._app(scope, receive, send)
+
     def is_robots(self, scope: Mapping[str, Any]) -> bool:
         """Whether a request is one that only a robot makes: for a decision, with the key."""
-        return scope["path"] in (ACT, BATCH) and self._keys.granted(dict(scope["headers"])) >= Level.ACT
+        if scope["path"] not in (ACT, BATCH, STREAM):
+            return False
+        return self._keys.granted(dict(scope["headers"])) >= Level.ACT
+
+    async def _refuse(
+        self, send: Send, status: int, place: str, name: str, message: str, kind: str = "http.response"
+    ) -> None:
+        self.refusals[status] += 1
+        await _refuse(send, status, place, name, message, kind)
 
 
 def _not_allowed(granted: Level, wanted: Level) -> tuple[int, str]:
@@ -101,7 +137,9 @@ def _limited(receive: Receive, max_body: int) -> Receive:
     return limited
 
 
-async def _refuse(send: Send, status: int, place: str, name: str, message: str) -> None:
+async def _refuse(
+    send: Send, status: int, place: str, name: str, message: str, kind: str = "http.response"
+) -> None:
     """Answers a request that is not read, and closes its connection."""
     detail = [{"loc": [place, name], "msg": message, "type": "refused"}]
     body = json.dumps({"detail": detail}).encode()
@@ -112,5 +150,5 @@ async def _refuse(send: Send, status: int, place: str, name: str, message: str) 
         headers.append(RETRY_AFTER)
     # The body was not read: the connection cannot carry another request.
     headers.append((b"connection", b"close"))
-    await send({"type": "http.response.start", "status": status, "headers": headers})
-    await send({"type": "http.response.body", "body": body})
+    await send({"type": f"{kind}.start", "status": status, "headers": headers})
+    await send({"type": f"{kind}.body", "body": body})

@@ -9,7 +9,8 @@ from enum import IntEnum
 from functools import cached_property
 from typing import Any
 
-ACT, BATCH = "/act", "/act/batch"
+ACT, BATCH, STREAM = "/act", "/act/batch", "/act/stream"
+MODEL, HOLD, RESUME, ALARMS = "/model", "/hold", "/resume", "/alarms"
 OPEN_PATHS = frozenset({"/healthz", "/readyz"})
 """What an orchestrator may ask without a key."""
 
@@ -32,6 +33,8 @@ def needed(scope: Mapping[str, Any]) -> Level:
     path = scope["path"]
     if path == ACT or path.startswith(f"{ACT}/"):
         return Level.ACT
+    if path.startswith(f"{ALARMS}/"):
+        return Level.ACT  # whoever drives robots says that an alarm was seen
     if path in OPEN_PATHS:
         return Level.NOTHING
     return Level.READ if scope.get("method", "GET") in ("GET", "HEAD") else Level.ADMIN

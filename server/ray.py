@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import logging
+import secrets
 import signal
 import sys
 import tempfile
@@ -21,11 +22,13 @@ from typing import Any
 from command import command, settings
 from models import BundleError
 from monitor import Monitor, MonitorError
-from server.app import MANY_FAULTS, create_app
+from server.alarms import RULES
+from server.app import create_app
 from server.crew import Alike
 from server.guard import Guard
+from server.keeper import KEY_BYTES
 from server.keys import Keys
-from server.serve import KEY_VARIABLE, ServeConfig, ServeError, read_keys
+from server.serve import KEY_VARIABLE, ServeConfig, ServeError, read_keys, read_memory_key
 
 NAME = "lagnet"
 """Of the application on the cluster."""
@@ -33,6 +36,7 @@ _HERE = frozenset(
     {
         *("bundle", "host", "port", "gate", "threshold", "guide", "max_body", "deadline_ms"),
         *("api_key_file", "read_key_file", "admin_key_file", "max_in_flight", "max_in_flight_all"),
+        "memory_key_file",
         *("margin", "position_error", "bearing_error", "travel_error", "delay_steps"),
     }
 )
@@ -72,17 +76,22 @@ class RayConfig(ServeConfig):
             raise ServeError(
                 f"--min-replicas must be 1 to --max-replicas, got {self.min_replicas} and {self.max_replicas}"
             )
+        if self.address is not None and self.memory_key_file is None:
+            raise ServeError("--memory-key-file: on a cluster those to come must take the memories of now")
         if not self.ongoing > 0.0:
             raise ServeError(f"--ongoing must be above 0, got {self.ongoing}")
 
 
-def replica(files: Mapping[str, bytes], config: RayConfig, keys: Keys) -> tuple[Monitor, Guard]:
+def replica(
+    files: Mapping[str, bytes], config: RayConfig, keys: Keys, memory_key: bytes
+) -> tuple[Monitor, Guard]:
     """What one replica runs: the monitor, warmed up, and the service around it.
 
     Args:
         files: name → content of the bundle's files.
         config: the settings.
         keys: those that requests must carry one of.
+        memory_key: what the replicas seal memories with.
     """
     with tempfile.TemporaryDirectory() as folder:
         bundle = Path(folder) / config.bundle.resolve().name
@@ -93,15 +102,18 @@ def replica(files: Mapping[str, bytes], config: RayConfig, keys: Keys) -> tuple[
     safety = config.safety()
     # A robot's requests come to any of the replicas.
     safety = replace(safety, freshness=replace(safety.freshness, alone=False))
-    return monitor, create_app(monitor, None, keys, config.max_body, safety=safety, around=Alike)
+    return monitor, create_app(
+        monitor, None, keys, config.max_body, safety=safety, memory_key=memory_key, around=Alike
+    )
 
 
-def application(config: RayConfig, keys: Keys) -> Any:
+def application(config: RayConfig, keys: Keys, memory_key: bytes) -> Any:
     """The application for `ray.serve.run`.
 
     Args:
         config: the settings.
         keys: those that requests must carry one of.
+        memory_key: what the replicas seal memories with.
 
     Raises:
         BundleError: if the bundle must not be used; a deployment that runs is left as it is.
@@ -114,15 +126,15 @@ def application(config: RayConfig, keys: Keys) -> Any:
     files = {path.name: path.read_bytes() for path in config.bundle.iterdir() if path.is_file()}
 
     class Replica:
-        def __init__(self, files: Mapping[str, bytes], config: RayConfig, keys: Keys) -> None:
-            self._monitor, self._service = replica(files, config, keys)
+        def __init__(self, *orders: Any) -> None:
+            self._monitor, self._service = replica(*orders)
 
         def __serve_build_asgi_app__(self) -> Guard:
             return self._service
 
         def check_health(self) -> None:
             """Ray starts a replica anew that fails too often by itself."""
-            if (faults := self._monitor.faults.internal()) >= MANY_FAULTS:
+            if (faults := self._monitor.faults.internal()) > RULES["faults"].limit:
                 raise RuntimeError(f"{faults} internal faults within a minute")
 
     deployment = serve.deployment(
@@ -136,7 +148,7 @@ def application(config: RayConfig, keys: Keys) -> Any:
         health_check_period_s=2,
         health_check_timeout_s=10,
     )(serve.ingress()(Replica))
-    return deployment.bind(files, config, keys)
+    return deployment.bind(files, config, keys, memory_key)
 
 
 def deploy(config: RayConfig) -> dict[str, Any]:
@@ -158,7 +170,8 @@ def deploy(config: RayConfig) -> dict[str, Any]:
             f"{config.host} can be reached from other machines: set {KEY_VARIABLE} or --api-key-file, "
             "or listen on 127.0.0.1"
         )
-    made = application(config, keys)
+    memory_key = read_memory_key(config.memory_key_file) or secrets.token_bytes(KEY_BYTES)
+    made = application(config, keys, memory_key)
     place = "EveryNode" if config.every_node else "HeadOnly"
     serve.start(proxy_location=place, http_options={"host": config.host, "port": config.port})
     try:

@@ -15,13 +15,16 @@ from pydantic_core import from_json
 from rich.console import Console
 
 from command import command, settings, terminal, why_not_file
+from decision import MEMORY, unpack
 from filter import FilterConfig
 from models import BundleError
 from monitor import Monitor, MonitorError
 from recorder import RecordingError
 from recorder.reading import Reader, Recorded
 from recorder.timeline import Row, Timeline
-from server.desk import UNDECIDED, Desk
+from server.desk import Desk
+from server.duty import UNDECIDED, Duty
+from server.keeper import AsItComes
 from server.schema import ModelReply
 
 DIFFERENT = 1
@@ -101,7 +104,7 @@ class Again:
             raise RecordingError(f"the recording is of another version of lagnet-serve: {error}") from error
         monitor = Monitor.load(bundle, gate, threshold, filter_config, guide)
         now = ModelReply.of(monitor)
-        self._desk = Desk(_nobody, monitor, now)
+        self._desk = Desk(_nobody, Duty(monitor, now), AsItComes())
         self.comparison = Comparison()
         self.other = None
         if now.sha256 != files:
@@ -145,9 +148,20 @@ def _differences(then: dict[str, Any], now: dict[str, Any]) -> list[str]:
     differences = []
     for name in {**then, **now}:
         one, two = (json.dumps(told.get(name)) for told in (then, now))
-        if name not in _NOT_COMPARED and one != two:
+        if name == "memory":
+            differences += [f"memory differs in {part}" for part in _memories_differ(then, now)]
+        elif name not in _NOT_COMPARED and one != two:
             differences.append(f"{name} was {one}, is {two}")
     return differences
+
+
+def _memories_differ(then: dict[str, Any], now: dict[str, Any]) -> list[str]:
+    """The parts in which two decisions' memories differ, bit for bit; their seals are each service's own."""
+    if "memory" not in then or "memory" not in now:
+        return ["all"]
+    one, two = unpack(then["memory"])[0], unpack(now["memory"])[0]
+    names = [name for name in MEMORY.names or () if name != "seal"]
+    return [name for name in names if one[name].tobytes() != two[name].tobytes()]
 
 
 async def _nobody(*_: object) -> None:

@@ -9,6 +9,7 @@ from fastapi import APIRouter, HTTPException, Path
 from pydantic import BaseModel
 
 from server.freshness import Freshness, RobotState
+from server.keeper import Keeper
 
 RESET = "reset_robot"
 """The id of the operation that ends a hold, for links to it."""
@@ -46,11 +47,14 @@ class RobotsReply(BaseModel):
     robots: list[RobotReply]
 
 
-def robots_router(freshness: Freshness, refusals: dict[int | str, dict[str, Any]]) -> APIRouter:
+def robots_router(
+    freshness: Freshness, keeper: Keeper, refusals: dict[int | str, dict[str, Any]]
+) -> APIRouter:
     """The two paths.
 
     Args:
         freshness: who knows the robots.
+        keeper: who remembers which of them had a sensor caught.
         refusals: the documented answers to requests without the right key.
     """
     router = APIRouter(responses=refusals)
@@ -66,7 +70,7 @@ def robots_router(freshness: Freshness, refusals: dict[int | str, dict[str, Any]
         responses={404: {"description": "no robot of this name is known"}},
     )
     async def reset(name: Annotated[str, Path(pattern=r"^[A-Za-z0-9_.:-]{1,64}$")]) -> dict[str, str]:
-        if not freshness.reset(name):
+        if not (freshness.reset(name) | keeper.forget(name)):
             raise HTTPException(404, "no robot of this name is known")
         return {"robot": name, "state": RobotState.FRESH}
 

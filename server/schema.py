@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, create_model
 
-from decision import PLAN_STEPS, Decision, Mode, OpenedBy, Origin, memory_from_json, memory_to_json
+from decision import PLAN_STEPS, Decision, Mode, OpenedBy, Origin, unpack
 
 if TYPE_CHECKING:
     from monitor import Monitor
@@ -33,29 +33,11 @@ MAX_HAZARDS = 1000
 """Most hazards a request may name."""
 MAX_ROBOTS = 256
 """Most robots of a batch."""
+MAX_MEMORY = 4096
+"""Most characters of a memory; what is no memory for other reasons is lost, not refused."""
+Sealed = Annotated[str, Field(strict=True, max_length=MAX_MEMORY)]
 HazardIndex = Annotated[int, Field(strict=True, ge=0, lt=2 * MAX_HAZARDS)]
 """The request's hazards are counted first, then what the lidar shows."""
-
-
-class MemoryJson(BaseModel):
-    """One robot's memory; `decision.memory_to_json` writes it and `decision.memory_from_json` reads it.
-
-    Attributes:
-        side: the side on which the robot passes what is in its way, and for how long that is remembered.
-        guided: whether the guide leads.
-        open: for how many more control steps the gate stays open.
-        history: base64 of what the robot was sent and saw, `decision.HISTORY`; empty: nothing yet.
-        plan: what is left of the certified plan: the actions that are safe to send next, one a control step,
-            if no further reply comes; after them the robot coasts.
-    """
-
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
-
-    side: int
-    guided: int
-    open: int
-    history: str = ""
-    plan: Annotated[list[Pair], Field(max_length=PLAN_STEPS)] | None
 
 
 class ActRequest(BaseModel):
@@ -66,6 +48,7 @@ class ActRequest(BaseModel):
         hazards: centres of the hazards in the body frame [m], x ahead, y left; left out, the lidar is
             decoded.
         memory: the `memory` of this robot's last reply, unchanged; left out before its first step.
+        played: for how many control steps the robot has gone on by itself since that reply, by its `plan`.
         request: any whole number; the reply repeats it, so that its sender knows which request it answers.
         robot: the robot's name, by which the service tells robots apart whichever way they come; at most 64
             letters, digits and "_.:-".
@@ -77,7 +60,8 @@ class ActRequest(BaseModel):
 
     observation: Annotated[list[Finite], Field(min_length=1)]
     hazards: Annotated[list[Pair], Field(max_length=MAX_HAZARDS)] | None = None
-    memory: MemoryJson | None = None
+    memory: Sealed | None = None
+    played: RequestNumber = 0
     request: RequestNumber = 0
     robot: RobotName | None = None
     stamp: Stamp | None = None
@@ -89,7 +73,10 @@ class Reply(BaseModel):
     Attributes:
         gate_open: whether the filter was active.
         gate: when the filter is active: risk, always, off.
+        memory: the robot's, sealed, to come back with its next request.
         model: the bundle's id.
+        plan: what is left of the certified plan: the actions that are safe to send next, one a control step,
+            if no further reply comes; after them the robot coasts.
         request: the request's number.
         seconds: how long the decision took [s].
     """
@@ -98,7 +85,9 @@ class Reply(BaseModel):
 
     gate_open: bool
     gate: str
+    memory: Sealed
     model: str
+    plan: Annotated[list[Pair], Field(max_length=PLAN_STEPS)]
     request: RequestNumber
     seconds: Finite
 
@@ -131,8 +120,8 @@ def _pair(value: list[float] | None) -> FloatArray:
     return np.full(2, np.nan) if value is None else np.array(value, np.float64)
 
 
-def _memory(value: MemoryJson) -> np.void:
-    memory: np.void = memory_from_json(value.model_dump())[0]
+def _memory(value: str) -> np.void:
+    memory: np.void = unpack(value)[0]
     return memory
 
 
@@ -141,7 +130,7 @@ _WIRE: dict[Any, Wire] = {
     FloatArray: Wire(Pair | None, _finite_pair, _pair),
     float: Wire(Finite | None, _finite, _number),
     int | None: Wire(HazardIndex | None),
-    np.void: Wire(MemoryJson, memory_to_json, _memory),
+    np.void: Wire(Sealed, None, _memory),
     **{kind: Wire(kind) for kind in _AS_IT_IS},
 }
 """A field's type in `Decision` → how it goes over the wire."""
@@ -164,6 +153,7 @@ def _wires() -> dict[str, Wire]:
 
 
 _FIELDS = _wires()
+_WRITERS = [(name, wire.write) for name, wire in _FIELDS.items() if name != "memory"]
 _DEFINITIONS: dict[str, Any] = {name: (wire.kind, ...) for name, wire in _FIELDS.items()}
 
 ActReply = create_model(
@@ -174,20 +164,37 @@ ActReply = create_model(
 )
 
 
-def reply_of(decision: Decision, request: int, model: str, gate: str, seconds: float) -> Reply:
-    """The `ActReply` that tells a decision.
+def reply_of(
+    decision: Decision, memory: str, request: int, model: str, gate: str, seconds: float
+) -> dict[str, Any]:
+    """What tells a decision, as `ActReply` reads it from JSON.
+
+    Args:
+        decision: what is told.
+        memory: its memory, as it leaves.
+        request: the request's number.
+        model: the bundle's id.
+        gate: when the filter is active.
+        seconds: how long the decision took [s].
 
     Raises:
-        pydantic.ValidationError: if its action is no action.
+        ValueError: if its action is no action.
     """
     told: dict[str, Any] = {}
-    for name, wire in _FIELDS.items():
+    for name, write in _WRITERS:
         value = getattr(decision, name)
-        told[name] = value if wire.write is None else wire.write(value)
-    reply: Reply = ActReply(
-        **told, gate_open=decision.gate_open, gate=gate, model=model, request=request, seconds=seconds
-    )
-    return reply
+        told[name] = value if write is None else write(value)
+    if told["action"] is None:
+        raise ValueError(f"the action is {decision.action.tolist()}")
+    return told | {
+        "memory": memory,
+        "gate_open": decision.gate_open,
+        "gate": gate,
+        "model": model,
+        "plan": decision.plan.tolist(),
+        "request": request,
+        "seconds": seconds,
+    }
 
 
 class BatchRequest(BaseModel):

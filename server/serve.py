@@ -8,16 +8,17 @@ import ipaddress
 import json
 import math
 import os
+import signal
 import socket
 import ssl
 import sys
 import time
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from types import FrameType
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import tyro
 import uvicorn
@@ -27,14 +28,20 @@ from filter import FilterConfig
 from models import BundleError
 from monitor import DEFAULT_STRENGTH, GateName, Monitor, MonitorError, Strength
 from recorder import Recorder, RecordingError, Settings
+from server.alarms import AlarmsError, read_rules
 from server.app import MAX_BODY, Lifecycle, create_app
+from server.change import ChangeError, Changer
 from server.crew import Crew
 from server.door import Connection, Door, Patience
+from server.events import Events, Form
 from server.freshness import Freshness, Limits
 from server.guard import Guard
+from server.keeper import KEY_BYTES
 from server.keys import Keys
+from server.operation import Operation
 from server.safety import Safety
 from server.schema import ModelReply
+from server.streaming import StreamConnection
 
 KEY_VARIABLE = "LAGNET_API_KEY"
 """Environment variable that may hold the key to ask for decisions."""
@@ -89,6 +96,9 @@ class ServeConfig:
     """How old observations are and how late actions take effect, together, in control steps."""
     api_key_file: Path | None = None
     """File that holds the key to ask for decisions; otherwise the environment variable LAGNET_API_KEY."""
+    memory_key_file: Path | None = None
+    """File with at least 32 bytes by which robots' memories are sealed: services that share it take each
+    other's, and a restart loses none. By default a key made at random."""
     read_key_file: Path | None = None
     """File that holds the key to read alone; otherwise the environment variable LAGNET_READ_KEY."""
     admin_key_file: Path | None = None
@@ -132,6 +142,13 @@ class ServeConfig:
     """Folder for the last 30 s before every fallback or alarm; by default that of --record."""
     incidents_mb: float = 256.0
     """Size of all files of incidents in it [MB]; where they come to more, the oldest go."""
+    alarms: Path | None = None
+    """TOML file with settings of alarms that are to be other than usual."""
+    log: Form = "text"
+    """How events are told on standard error: warnings and errors as text, or all of them as JSON, a line
+    each."""
+    bundles: Path | None = None
+    """Folder with other bundles, which POST /model may change to. SIGHUP loads the service's own anew."""
 
     def filter_config(self) -> FilterConfig:
         """The filter's settings, or ServeError for one that is out of its range."""
@@ -151,6 +168,8 @@ class ServeConfig:
             raise ServeError(f"--workers must be at least 1, got {self.workers}")
         if self.workers > 1 and self.max_age_ms is not None:
             raise ServeError("--max-age-ms: one process must follow a robot's clock, not with --workers")
+        if self.workers > 1 and self.bundles is not None:
+            raise ServeError("--bundles: POST /model would change one process alone: not with --workers")
         if self.max_body < 1 or self.max_connections < 1:
             raise ServeError("--max-body and --max-connections must be at least 1")
         for flag, seconds in (("--read-seconds", self.read_seconds), ("--idle-seconds", self.idle_seconds)):
@@ -161,6 +180,8 @@ class ServeConfig:
         self.safety()
         self._check_tls()
         self._check_recording()
+        if self.bundles is not None and not self.bundles.is_dir():
+            raise ServeError(f"--bundles {self.bundles}: no such folder")
 
     def safety(self) -> Safety:
         """The limits within which it decides, or ServeError for one that is none."""
@@ -242,6 +263,8 @@ class DrainingServer(uvicorn.Server):
         announcement: a line for stdout, written once it listens and stops in order when told to.
         door: who may stay connected.
         freshness: which robots it knows.
+        operation: looked at ten times a second.
+        changer: loads the bundle anew on SIGHUP.
         crew: the workers that it is one of.
     """
 
@@ -253,10 +276,15 @@ class DrainingServer(uvicorn.Server):
         announcement: str,
         door: Door,
         freshness: Freshness | None = None,
+        operation: Operation | None = None,
+        changer: Changer | None = None,
         crew: Crew | None = None,
     ) -> None:
         super().__init__(config)
+        self._operation = operation
         self._crew = crew
+        self._changer = changer
+        self._change: asyncio.Task[None] | None = None
         self.server_state = self._door = door
         self._freshness = freshness
         self._lifecycle = lifecycle
@@ -284,6 +312,8 @@ class DrainingServer(uvicorn.Server):
             )
             for listener in sockets or []
         ]
+        if self._changer is not None and hasattr(signal, "SIGHUP"):
+            asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, self._on_hangup, self._changer)
         sys.stdout.write(self._announcement + "\n")
         sys.stdout.flush()
 
@@ -299,9 +329,23 @@ class DrainingServer(uvicorn.Server):
         self._door.sweep(asyncio.get_running_loop().time())
         if self._freshness is not None:
             self._freshness.sweep(time.perf_counter())
+        if self._operation is not None:
+            # Not in the signal's handler: it may come in the middle of anything.
+            if self._lifecycle.draining:
+                self._operation.drain()
+            if self._freshness is not None:
+                self._operation.unwell(self._freshness.unwell(time.perf_counter()))
+            self._operation.tick()
         if self._stop_at is not None and time.monotonic() >= self._stop_at:
             self.should_exit = True
         return await super().on_tick(counter)
+
+    def _on_hangup(self, changer: Changer) -> None:
+        async def again() -> None:
+            with suppress(ChangeError):  # it was told
+                await changer.again()
+
+        self._change = asyncio.get_running_loop().create_task(again())
 
 
 def listen(host: str, port: int, keys: Keys) -> socket.socket:
@@ -370,6 +414,23 @@ def read_keys(config: ServeConfig) -> Keys:
         raise ServeError(str(error)) from error
 
 
+def read_memory_key(path: Path | None) -> bytes | None:
+    """The key that seals memories, if a file holds one.
+
+    Raises:
+        ServeError: if the file cannot be read, or has too few bytes.
+    """
+    if path is None:
+        return None
+    try:
+        key = path.read_bytes()
+    except OSError as error:
+        raise ServeError(f"--memory-key-file {path}: cannot be read: {error.strerror}") from error
+    if len(key) < KEY_BYTES:
+        raise ServeError(f"--memory-key-file {path} must hold at least {KEY_BYTES} bytes, has {len(key)}")
+    return key
+
+
 def allow_files(connections: int) -> None:
     """Allows this process as many open files as so many robots and newcomers take.
 
@@ -390,33 +451,53 @@ def allow_files(connections: int) -> None:
         resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
 
 
-def serve(config: ServeConfig, crew: Crew | None = None, listener: socket.socket | None = None) -> None:
+class Place(NamedTuple):
+    """A worker's place among the others.
+
+    Attributes:
+        crew: the workers that it is one of.
+        listener: the socket that all of them accept from.
+        memory_key: the key that all of them seal memories with.
+    """
+
+    crew: Crew
+    listener: socket.socket
+    memory_key: bytes
+
+
+def serve(config: ServeConfig, place: Place | None = None) -> None:
     """Serves until told to stop.
 
     Args:
         config: the settings.
-        crew: the workers that this process is one of.
-        listener: the listening socket, if there is one already.
+        place: that of one worker; None: the service is not one of several.
 
     Raises:
         ServeError: for settings or an address that cannot be had.
+        AlarmsError: for settings of alarms that cannot be used.
         BundleError: if the bundle must not be used.
         MonitorError: if it cannot be run with these settings.
         RecordingError: if it cannot be recorded.
     """
     config.check()
     keys = read_keys(config)
+    memory_key = place.memory_key if place is not None else read_memory_key(config.memory_key_file)
+    rules = read_rules(config.alarms)
     allow_files(config.max_connections)
-    listener = listener or listen(config.host, config.port, keys)
     if config.workers > 1:
         from server.workers import supervise
 
-        supervise(config, listener)
+        if holds := [name for name, rule in rules.items() if rule.effect == "hold"]:
+            raise ServeError(f"--alarms: {holds[0]} would hold one process alone: not with --workers")
+        supervise(config, listen(config.host, config.port, keys), memory_key)
         return
+    listener = place.listener if place is not None else listen(config.host, config.port, keys)
     with listener:
-        monitor = Monitor.load(
-            config.bundle, config.gate, config.threshold, config.filter_config(), config.guide
-        )
+
+        def load(bundle: Path) -> Monitor:
+            return Monitor.load(bundle, config.gate, config.threshold, config.filter_config(), config.guide)
+
+        monitor = load(config.bundle)
         lifecycle = Lifecycle()
         host, port = listener.getsockname()[:2]
         scheme = "http" if config.tls_cert is None else "https"
@@ -424,17 +505,33 @@ def serve(config: ServeConfig, crew: Crew | None = None, listener: socket.socket
         ready = {"event": "listening", "url": url, "host": host, "port": port, "model": monitor.bundle.id}
         gate = {"gate": monitor.gate.name, "threshold": monitor.gate.threshold, "guide": config.guide}
         announcement = json.dumps(ready | gate)
-        with recorder_of(config, monitor) as recorder:
+        with Events(config.log) as events, recorder_of(config, monitor) as recorder:
             safety = config.safety()
-            if crew is not None:
+            if place is not None:
                 safety = replace(safety, freshness=replace(safety.freshness, alone=False))
             freshness = Freshness(safety.freshness, monitor.faults.note)
-            around = None if crew is None else crew.around
-            app = create_app(monitor, lifecycle, keys, config.max_body, recorder, safety, freshness, around)
+            operation = Operation(monitor, recorder, rules, events)
+            changer = Changer(operation, load, config.bundle, config.bundles)
+            app = create_app(
+                monitor,
+                lifecycle,
+                keys,
+                config.max_body,
+                recorder,
+                operation=operation,
+                changer=changer,
+                safety=safety,
+                freshness=freshness,
+                memory_key=memory_key,
+                around=None if place is None else place.crew.around,
+            )
             # What is loaded stays: looking through it again and again for garbage would hold up decisions.
             gc.collect()
             gc.freeze()
-            _server(app, lifecycle, config, announcement, freshness, crew).run(sockets=[listener])
+            crew = None if place is None else place.crew
+            server = _server(app, lifecycle, config, announcement, freshness, operation, changer, crew)
+            server.run(sockets=[listener])
+            operation.stop()
 
 
 def recorder_of(config: ServeConfig, monitor: Monitor) -> AbstractContextManager[Recorder | None]:
@@ -455,14 +552,20 @@ def _server(
     config: ServeConfig,
     announcement: str,
     freshness: Freshness,
+    operation: Operation,
+    changer: Changer,
     crew: Crew | None,
 ) -> DrainingServer:
     settings = uvicorn.Config(
         app,
         access_log=False,
+        log_config=None,  # `Events` tells what it logs
         log_level="error",  # warnings are of what anybody may send, a line each
         lifespan="off",
-        ws="none",
+        ws=StreamConnection,
+        ws_max_size=config.max_body,
+        ws_ping_interval=None,  # whoever is silent has a deadline
+        ws_per_message_deflate=False,  # it would take longer than the decision
         server_header=False,
         http=Connection,
         timeout_keep_alive=math.ceil(config.idle_seconds),
@@ -472,12 +575,14 @@ def _server(
     )
     patience = Patience(config.read_seconds, config.idle_seconds, config.max_connections)
     door = Door(patience, app.is_robots)
-    return DrainingServer(settings, lifecycle, config.drain_seconds, announcement, door, freshness, crew)
+    return DrainingServer(
+        settings, lifecycle, config.drain_seconds, announcement, door, freshness, operation, changer, crew
+    )
 
 
 def main() -> None:
     """Entry point of `lagnet-serve`: exit status 0 after an orderly stop, 2 if it could not start."""
-    with command("lagnet-serve", ServeError, BundleError, MonitorError, RecordingError):
+    with command("lagnet-serve", ServeError, AlarmsError, BundleError, MonitorError, RecordingError):
         serve(settings(ServeConfig, "lagnet-serve"))
 
 

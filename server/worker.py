@@ -20,8 +20,9 @@ from command import command
 from models import BundleError
 from monitor import MonitorError
 from recorder import RecordingError
+from server.alarms import AlarmsError
 from server.crew import Crew, Roster
-from server.serve import ServeConfig, ServeError, serve
+from server.serve import Place, ServeConfig, ServeError, serve
 
 
 @dataclass(frozen=True)
@@ -33,12 +34,14 @@ class Order:
         number: the worker's, from 1.
         listener: the descriptor of the listening socket, which it inherits.
         places: the sockets at which the workers talk to each other, in order.
+        memory_key: the key that all of them seal memories with, in hexadecimal digits.
     """
 
     config: ServeConfig
     number: int
     listener: int
     places: list[Path]
+    memory_key: str
 
 
 ORDER = TypeAdapter(Order)
@@ -58,8 +61,9 @@ def main() -> None:
     order = ORDER.validate_json(orders.readline())
     crew = Crew(order.number, order.places)
     Thread(target=_follow, args=(orders, crew), daemon=True).start()
-    with command("lagnet-serve", ServeError, BundleError, MonitorError, RecordingError):
-        serve(order.config, crew, socket.socket(fileno=order.listener))
+    with command("lagnet-serve", ServeError, AlarmsError, BundleError, MonitorError, RecordingError):
+        listener = socket.socket(fileno=order.listener)
+        serve(order.config, Place(crew, listener, bytes.fromhex(order.memory_key)))
 
 
 if __name__ == "__main__":

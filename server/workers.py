@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
+import secrets
 import signal
 import socket
 import sys
@@ -19,6 +20,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from server.crew import Roster, ask
+from server.events import Events
+from server.keeper import KEY_BYTES
 from server.serve import ServeConfig
 from server.worker import ORDER, ROSTER, Order
 
@@ -32,18 +35,20 @@ _FAILED = 2
 _LOG = logging.getLogger("lagnet.workers")
 
 
-def supervise(config: ServeConfig, listener: socket.socket) -> None:
+def supervise(config: ServeConfig, listener: socket.socket, memory_key: bytes | None) -> None:
     """Serves with several workers until told to stop.
 
     Args:
         config: the settings; they have been checked.
         listener: what all of them accept from.
+        memory_key: what they seal memories with; None: one made at random.
 
     Raises:
         SystemExit: if one of them cannot start; it has said why.
     """
-    with tempfile.TemporaryDirectory(prefix="lagnet-") as folder:
-        asyncio.run(Supervisor(config, listener, Path(folder)).run())
+    key = memory_key or secrets.token_bytes(KEY_BYTES)
+    with Events(config.log), tempfile.TemporaryDirectory(prefix="lagnet-") as folder:
+        asyncio.run(Supervisor(config, listener, Path(folder), key).run())
 
 
 def part(config: ServeConfig, number: int) -> ServeConfig:
@@ -71,12 +76,13 @@ class Supervisor:
         config: the settings; they have been checked.
         listener: what the workers accept from; it is closed here when they are to stop.
         folder: where they talk to each other; nobody else may read it.
+        key: what they seal memories with.
     """
 
-    def __init__(self, config: ServeConfig, listener: socket.socket, folder: Path) -> None:
+    def __init__(self, config: ServeConfig, listener: socket.socket, folder: Path, key: bytes) -> None:
         numbers = range(1, config.workers + 1)
         places = [folder / f"{number}.sock" for number in numbers]
-        self._orders = {n: Order(part(config, n), n, listener.fileno(), places) for n in numbers}
+        self._orders = {n: Order(part(config, n), n, listener.fileno(), places, key.hex()) for n in numbers}
         self._listener = listener
         self._roster = Roster(config.workers)
         self._running: dict[int, Process] = {}

@@ -56,7 +56,9 @@ def gap(obstacles: FloatArray, i: int, x: float, y: float) -> float:
     if at <= 0.0 or length == 0.0:
         return math.sqrt(qx * qx + qy * qy) - float(obstacles[i, 4])
     if at >= length:
-        return math.sqrt((along - length) * (along - length) + aside * aside) - float(obstacles[i, 4] + obstacles[i, 5])
+        return math.sqrt((along - length) * (along - length) + aside * aside) - float(
+            obstacles[i, 4] + obstacles[i, 5]
+        )
     return float(aside * obstacles[i, 11] - along * obstacles[i, 10] - obstacles[i, 4])
 
 
@@ -87,8 +89,8 @@ def gap_segment(
     least = min(start, end)
     if 0.5 * (start + end - length) >= min(least, bound):
         return least
-    # A cone is convex, and along the segment its distance bends smoothly but where the axis is crossed. Beside
-    # the straight sides it is linear, so that it is least at an end, there, or where a centre is nearest.
+    # A cone is convex, and its distance along the segment smooth but where that crosses the axis; beside the
+    # straight sides it is linear. So it is least at an end, there, or where a centre is nearest.
     if 0.0 < at < 1.0:
         least = min(least, gap(obstacles, i, x0 + at * dx, y0 + at * dy))
     at += (obstacles[i, 2] * dx + obstacles[i, 3] * dy) / square

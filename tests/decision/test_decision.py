@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from dataclasses import fields
+from dataclasses import FrozenInstanceError, fields
 from itertools import pairwise
 from pathlib import Path
 
@@ -73,6 +73,20 @@ def test_a_decision_is_the_batchs_row(batch) -> None:
         assert one.hazard is None or type(one.hazard) is int
 
 
+def test_a_row_is_whole_and_stays_as_it_is(batch) -> None:
+    one = batch[0]
+    assert list(vars(one)) == [field.name for field in fields(Decision)]
+    with pytest.raises(FrozenInstanceError):
+        one.mode = Mode.NOMINAL
+
+
+def test_what_is_sent_is_changed_unless_it_is_nominal(batch) -> None:
+    assert batch.changed.tolist() == [mode != "nominal" for mode in batch.mode.tolist()]
+    for mode in (texts(Mode.NOMINAL, N), np.array([Mode.NOMINAL] * N, dtype=np.str_)):
+        batch.mode = mode
+        assert batch.changed.tolist() == [False] * N
+
+
 def test_rows_make_the_batch_again(batch) -> None:
     again = Decisions.of([batch[k] for k in range(N)])
     for field in fields(Decisions):
@@ -122,8 +136,7 @@ for name in ("numba", "scipy", "onnxruntime", "onnx", "pydantic", "fastapi", "os
              "mujoco", "gymnasium"):
     sys.modules[name] = None
 import decision
-memory = decision.memory_to_json(decision.memory_of(1, None)[0]) | {"plan": [[0.0, 1.0]]}
-decision.next_of_plan(decision.memory_from_json(memory))
+decision.next_of_plan(decision.unpack(decision.pack(decision.memory_of(1, None).tobytes())))
 rooms = {"system", "filter", "guide", "inference", "novelty", "monitor", "models", "server"}
 rooms |= {"trainer", "evaluation", "pointgoal"}
 assert not rooms & set(sys.modules)

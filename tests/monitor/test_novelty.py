@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from decision import MEMORY, Mode, OpenedBy, memory_from_json, memory_to_json
+from decision import MEMORY, Mode, OpenedBy, pack, unpack
 from models import Bundle, BundleError, write_bundle
 from monitor import Monitor
 from pointgoal.observation import layout
@@ -90,7 +90,7 @@ def test_what_is_not_trusted_survives_the_wire(bundle, under_way) -> None:
     observation[:, layout(1).slice("hazards_lidar")] = 0.0
     monitor = Monitor.load(bundle)
     memory = monitor.decide_batch(observation, None, under_way[1][:1]).memory
-    again = memory_from_json(memory_to_json(memory[0]))
+    again = unpack(pack(memory.tobytes()))
     assert again["history"].tobytes() == memory["history"].tobytes()
     assert monitor.decide(under_way[0][0], None, again).mode == Mode.FALLBACK
 

@@ -213,6 +213,12 @@ def test_what_is_no_normal_is_refused(normal, change, named) -> None:
         Normal.from_bytes(Normal(**(vars(normal) | change)).to_bytes(), 60)
 
 
+def test_a_precision_that_is_none_is_refused(normal) -> None:
+    none = Normal(**(vars(normal) | {"precision": -normal.precision}))
+    with pytest.raises(ValueError, match="precision must be positive definite"):
+        Watch(none, Robot())
+
+
 @pytest.mark.parametrize("data", [b"", b"PK\x03\x04 no zip", b"\x93NUMPY"])
 def test_what_is_no_file_is_refused(data) -> None:
     with pytest.raises(ValueError, match="no NPZ file"):

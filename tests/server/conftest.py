@@ -14,9 +14,11 @@ import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 
+from decision import MEMORY, Faults
 from monitor import Monitor
 from pointgoal.lidar import encode
 from server.app import create_app
+from server.keeper import Keeper, Past
 from server.schema import ModelReply
 
 
@@ -29,7 +31,26 @@ def monitor(tiny_bundle: Path) -> Monitor:
 @pytest.fixture
 def app(monitor: Monitor) -> TestClient:
     """The service in this process; what it raises, the test sees."""
-    return TestClient(create_app(monitor))
+    return TestClient(create_app(monitor, memory_key=KEY))
+
+
+KEY = b"k" * 32
+
+
+@pytest.fixture
+def sealed(monitor: Monitor) -> Callable[..., str]:
+    """Seals a memory with a plan, and other fields, as the service `app` does for a robot."""
+    keeper = Keeper(KEY, Faults())
+
+    def seal(plan: list[list[float]], robot: str | None = None, **fields: int) -> str:
+        memory = np.zeros(1, MEMORY)
+        memory["planned"], memory["left"] = True, len(plan)
+        memory["plan"][0, : len(plan)] = np.reshape(plan, (-1, 2))
+        for name, value in fields.items():
+            memory[name] = value
+        return keeper.seal(memory[0], robot, monitor.bundle.id, Past(None, None, None))
+
+    return seal
 
 
 @pytest.fixture

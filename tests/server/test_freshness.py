@@ -289,3 +289,27 @@ def test_a_stamp_that_is_none_is_refused_and_named(app, observation, stamp) -> N
     reply = app.post("/act", content=content)
     assert reply.status_code == 422
     assert reply.json()["detail"][0]["loc"] == ["body", "stamp"]
+
+
+@given(
+    asked=st.lists(st.tuples(st.sampled_from("abc"), st.floats(0.01, 0.5), st.booleans()), max_size=30),
+    later=st.floats(0.0, 200.0),
+)
+def test_who_is_unwell_is_stale_held_or_missed(asked, later: float) -> None:
+    freshness = Freshness(Limits(max_age=0.05, hold_after=0.3, silent_after=1.0))
+    now = 10.0
+    for robot, gap, old in asked:
+        now += gap
+        freshness.see(robot, now - (1.0 if old else 0.0), now)
+    now += later
+    unwell = set(freshness.unwell(now))
+    for seen in freshness.robots(now):
+        if seen.state is RobotState.HELD:
+            assert seen.robot in unwell
+        elif seen.ago >= 60.0:
+            # It has left.
+            assert seen.robot not in unwell
+        else:
+            late = seen.late >= MANY_LATE
+            well = seen.state is RobotState.FRESH and not late
+            assert (seen.robot not in unwell) is (well and seen.reason is None)

@@ -5,6 +5,9 @@ from __future__ import annotations
 import subprocess
 import sys
 
+from pydantic_core import to_json
+
+from decision import pack
 from server.schema import reply_of
 
 SCRIPT = """
@@ -12,7 +15,7 @@ import sys
 heavy = (
     "torch", "mujoco", "gymnasium", "scipy", "onnx", "onnxruntime", "numba", "osqp", "qpsolvers", "fastapi",
     "starlette", "uvicorn", "tyro", "rich", "monitor", "inference", "models", "filter", "guide", "system",
-    "pointgoal",
+    "pointgoal", "websockets", "msgpack", "httpx", "prometheus_client",
 )
 for name in heavy:
     sys.modules[name] = None  # an import of it now raises ImportError
@@ -33,8 +36,10 @@ def test_the_clients_need_numpy_and_pydantic_alone(fake, http, monitor) -> None:
 
     def act(connection, asked) -> None:
         number = int(asked.partition(b'"request":')[2].partition(b",")[0])
-        reply = reply_of(decision, number, monitor.bundle.id, "always", 0.001)
-        connection.sendall(http(reply.model_dump_json().encode()))
+        memory = pack(decision.memory.tobytes())
+        connection.sendall(
+            http(to_json(reply_of(decision, memory, number, monitor.bundle.id, "always", 0.001)))
+        )
 
     with fake(monitor, act) as url:
         result = subprocess.run(

@@ -52,6 +52,7 @@ def free_port() -> int:
         ({"min_replicas": 0}, "--min-replicas must be 1 to --max-replicas"),
         ({"min_replicas": 5}, "--min-replicas must be 1 to --max-replicas, got 5 and 4"),
         ({"ongoing": 0.0}, "--ongoing"),
+        ({"address": "auto"}, "--memory-key-file"),
     ],
 )
 def test_what_a_replica_cannot_do_is_refused(settings: dict[str, Any], named: str) -> None:
@@ -63,7 +64,7 @@ def test_a_replica_answers_what_the_service_does(monitor, tiny_bundle: Path, obs
     """The bundle is that of the driver's files, whatever lies on the node."""
     files = {path.name: path.read_bytes() for path in tiny_bundle.iterdir()}
     config = RayConfig(Path("/elsewhere") / tiny_bundle.name, gate="always")
-    mine, app = make_replica(files, config, Keys(act="sesame"))
+    mine, app = make_replica(files, config, Keys(act="sesame"), bytes(32))
     service, plain = TestClient(app), TestClient(create_app(monitor))
     asked = {"observation": observation}
     assert service.post("/act", json=asked).status_code == 401
@@ -73,6 +74,7 @@ def test_a_replica_answers_what_the_service_does(monitor, tiny_bundle: Path, obs
     ]
     for reply in replies:
         reply.pop("seconds")
+        reply.pop("memory")  # sealed with another key
     assert replies[0] == replies[1]
     assert mine.bundle.id == monitor.bundle.id
     key = {"x-api-key": "sesame"}
@@ -116,9 +118,18 @@ def cluster() -> Iterator[Any]:
 
 
 @pytest.mark.long
-def test_a_robot_drives_on_while_the_bundle_changes_and_a_node_dies(cluster) -> None:
+def test_a_robot_drives_on_while_the_bundle_changes_and_a_node_dies(cluster, tmp_path: Path) -> None:
     nodes, second = cluster
-    config = RayConfig(MODELS / "lagnet1", port=free_port(), min_replicas=2, max_replicas=2, every_node=False)
+    key = tmp_path / "key"
+    key.write_bytes(bytes(32))
+    config = RayConfig(
+        MODELS / "lagnet1",
+        port=free_port(),
+        min_replicas=2,
+        max_replicas=2,
+        every_node=False,
+        memory_key_file=key,
+    )
     url = deploy(config)["url"]
     with Client(url, timeout=5.0) as client:
         assert client.model().model.startswith("lagnet1@")

@@ -233,7 +233,8 @@ def test_a_full_disk_stops_the_recording_with_an_alarm_and_never_the_service(
         link.request("GET", "/readyz")
         assert link.getresponse().status == 200
         assert service.stop() == 0
-        [line] = service.complaints().splitlines()
+        line, *alarms = service.complaints().splitlines()
+        assert all("alarm='recorder'" in alarm for alarm in alarms)
         assert line == f"{told['alarm']}; the service goes on"
     [path] = of_kind(tmp_path, "recording")
     assert path.stat().st_size == 100 * 1024
@@ -256,7 +257,8 @@ def test_a_recorder_that_is_gone_stops_the_recording_and_never_the_service(
         for _ in range(100):
             robot.ask()
         assert service.stop() == 0
-        [line] = service.complaints().splitlines()
+        line, *alarms = service.complaints().splitlines()
+        assert all("alarm='recorder'" in alarm for alarm in alarms)
         assert "the service goes on" in line
 
 
@@ -321,4 +323,4 @@ def test_without_recording_there_is_no_recorder(tiny_bundle: Path) -> None:
             client.model()
         link = http.client.HTTPConnection(urlsplit(service.url).netloc)
         link.request("GET", "/healthz")
-        assert json.loads(link.getresponse().read()) == {"status": "alive"}
+        assert json.loads(link.getresponse().read()) == {"status": "alive", "state": "ready"}

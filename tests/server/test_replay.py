@@ -17,7 +17,6 @@ import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 
-from decision import memory_to_json
 from filter import FilterConfig
 from monitor import Monitor
 from recorder import Recorder, Settings
@@ -260,7 +259,7 @@ def test_a_fault_is_recorded_and_is_an_incident(
     wanted = Settings(str(tmp_path), 10**9, 10**8, str(tmp_path), 10**9)
     with Recorder(wanted, ModelReply.of(broken).model_dump(), {}) as recorder:
         app = TestClient(create_app(broken, recorder=recorder))
-        memory = memory_to_json(broken.decide(observation).memory)
+        memory = app.post("/act", json={"observation": observation}).json()["memory"]
         body = {"observation": observation, "memory": memory}
         assert app.post("/act", json=body).status_code == 200
         broken.decide = lambda *_: 1 / 0
@@ -274,7 +273,7 @@ def test_a_fault_is_recorded_and_is_an_incident(
     # Decided again, it is not as it was.
     result = replay(incident, "--bundle", tiny_bundle)
     assert result.returncode == 1
-    assert "1 of 2 decisions differ" in result.stdout
+    assert "1 of 3 decisions differ" in result.stdout
 
 
 def test_the_filters_settings_are_those_of_then(

@@ -16,6 +16,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
+from fastapi.testclient import TestClient
 from hypothesis import given
 from hypothesis import strategies as st
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
@@ -24,7 +25,9 @@ from prometheus_client.parser import text_string_to_metric_families
 from evaluation.closed_loop import run_episodes
 from evaluation.service import Service
 from server import Client, Fleet
+from server.app import create_app
 from server.crew import Crew, labelled
+from server.keys import Keys
 from server.serve import ServeConfig, ServeError, serve
 from server.workers import part
 
@@ -103,11 +106,19 @@ def test_robots_drive_on_while_one_worker_after_the_other_is_killed(service: Ser
 
 
 def test_what_one_worker_alone_would_hear_is_refused(service: Service) -> None:
-    for path in ("/hold", "/model", "/alarms", "/robots/one/reset"):
+    for path in ("/alarms/risk/ack", "/robots/one/reset"):
         status, said = get(service, path, "POST")
         assert status == 501
         assert said["detail"][0]["msg"].startswith(f"POST {path} would reach one of the workers alone")
     assert get(service, "/model")[0] == 200
+
+
+def test_a_hold_is_refused(monitor, tmp_path: Path) -> None:
+    """It would hold the robots of one worker, until that one dies."""
+    crew = Crew(1, [tmp_path / "1"])
+    app = TestClient(create_app(monitor, keys=Keys(admin="sesame"), around=crew.around))
+    for path in ("/hold", "/resume", "/model"):
+        assert app.post(path, headers={"x-api-key": "sesame"}).status_code == 501
 
 
 def test_what_is_stamped_is_not_decided_about(service: Service, observation: list[float]) -> None:
@@ -121,6 +132,20 @@ def test_what_is_stamped_is_not_decided_about(service: Service, observation: lis
     assert "several processes answer" in reply["reason"]
     status, said = get(service, "/robots")
     assert (status, [one["robots"] for one in said["each"]]) == (200, [[], []])
+
+
+def test_alarms_and_metrics_are_those_of_all(service: Service) -> None:
+    status, said = get(service, "/alarms")
+    assert (status, len(said["each"])) == (200, 2)
+    first, second = ([alarm["name"] for alarm in one["list"]] for one in said["each"])
+    assert "latency" in first
+    assert first == second
+    link = http.client.HTTPConnection(urlsplit(service.url).netloc, timeout=10.0)
+    link.request("GET", "/metrics")
+    text = link.getresponse().read().decode()
+    link.close()
+    [family] = [one for one in text_string_to_metric_families(text) if one.name == "lagnet_threshold"]
+    assert [sample.labels for sample in family.samples] == [{"worker": "1"}, {"worker": "2"}]
 
 
 def test_every_worker_gets_robots(service: Service) -> None:
@@ -218,7 +243,13 @@ def test_what_cannot_be_served_is_one_line() -> None:
     assert "no such bundle" in result.stderr
 
 
-def test_what_several_workers_cannot_do_is_refused(tiny_bundle: Path) -> None:
+def test_what_several_workers_cannot_do_is_refused(tiny_bundle: Path, tmp_path: Path) -> None:
+    rules = tmp_path / "alarms.toml"
+    rules.write_text('[risk]\neffect = "hold"\n')
+    with pytest.raises(ServeError, match="--alarms: risk would hold one process alone"):
+        serve(ServeConfig(tiny_bundle, workers=2, alarms=rules))
+    with pytest.raises(ServeError, match="--bundles: POST /model would change one process alone"):
+        serve(ServeConfig(tiny_bundle, workers=2, bundles=tmp_path))
     with pytest.raises(ServeError, match="--max-age-ms: one process must follow a robot's clock"):
         serve(ServeConfig(tiny_bundle, workers=2, max_age_ms=100.0))
     with pytest.raises(ServeError, match="--workers must be at least 1, got 0"):
