@@ -1,4 +1,4 @@
-"""The demo: a service for each gate, robots driving through it, a table, a picture and an animation."""
+"""The demo: a service for each gate, robots driving through it, a table, pictures and an animation."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import math
 import signal
 import time
 from collections.abc import Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
@@ -31,6 +32,8 @@ from pointgoal.simulation import EPISODE_STEPS
 
 GATES: tuple[GateName, ...] = ("off", "risk", "always")
 """The gates that the demo drives through, in the order in which it shows them."""
+WATCHED: GateName = "risk"
+"""The gate under which the live page is watched."""
 _HAZARDS = {"lidar": "by lidar alone", "given": "given"}
 
 
@@ -44,7 +47,7 @@ class DemoConfig:
     bundle: Annotated[Path, tyro.conf.Positional]
     """The bundle's folder, for example models/NAME."""
     out: Path = Path("demo")
-    """Folder for the table, the picture and the animation."""
+    """Folder for the table, the pictures and the animation."""
     episodes: int = 20
     """How many episodes for each gate, the same ones."""
     seed: int = 0
@@ -78,9 +81,15 @@ def run_demo(config: DemoConfig, console: Console) -> None:
     console.print(
         f"{bundle.id} on {bundle.manifest.task}, through POST /act, {config.episodes} robots at once"
     )
-    runs = {gate: _drive_through(gate, bundle, config, console) for gate in GATES}
+    runs, said = {}, []
+    for gate in GATES:
+        runs[gate], told = _drive_through(gate, bundle, config, console)
+        said += told
     title = f"{config.episodes} episodes, hazards {_HAZARDS[config.hazards]}, over HTTP"
     show(runs, config.out, bundle.manifest.threshold, title, console)
+    for line in said:
+        console.print(line)
+    console.print(f"to see it live: lagnet-serve {config.bundle}, and http://127.0.0.1:8000/ in a browser")
     console.print(f"done in {time.monotonic() - started:.0f} s")
 
 
@@ -115,20 +124,25 @@ def show(
     console.print(f"{animation}: the same episode without and with the filter")
 
 
-def _drive_through(gate: GateName, bundle: Bundle, config: DemoConfig, console: Console) -> Episodes:
-    """The episodes under one gate, through a service of its own."""
+def _drive_through(
+    gate: GateName, bundle: Bundle, config: DemoConfig, console: Console
+) -> tuple[Episodes, list[str]]:
+    """The episodes under one gate, through a service of its own; what is to be said of its page's picture."""
+    from evaluation.camera import camera
     from evaluation.remote import asked
     from evaluation.service import Service
 
     bar = progress_bar(console)
+    said: list[str] = []
     wanted = layout(bundle.manifest.level).to_json()
     with (
         bar,
         Service.start(config.bundle, gate) as service,
         asked(service.url, wanted, config.timeout) as (decider, _),
+        camera(service.url, config.out / "live.png", said) if gate == WATCHED else nullcontext(),
     ):
         job = bar.add_task(f"gate {gate}", total=config.episodes * EPISODE_STEPS)
-        return run_episodes(
+        episodes = run_episodes(
             bundle.manifest.task,
             decider,
             config.episodes,
@@ -138,6 +152,7 @@ def _drive_through(gate: GateName, bundle: Bundle, config: DemoConfig, console: 
             progress=lambda steps: bar.advance(job, steps),
             use=Use.DEMO,
         )
+    return episodes, said
 
 
 def choose_episode(off: Episodes, always: Episodes) -> int:

@@ -69,6 +69,7 @@ class Monitor:
     Attributes:
         faults: what went wrong so far.
         robot: the constants of the bundle's robot.
+        look: what N robots see, and nothing is decided; see `ActionFilter.look`.
         stopwatch: how long "inference" and "filter" took.
 
     Raises:
@@ -98,7 +99,7 @@ class Monitor:
         wanted = manifest.threshold if threshold is None else float(threshold)
         self.gate = Gate(gate, wanted, manifest.hysteresis, manifest.dwell) if isinstance(gate, str) else gate
         self._networks = networks
-        self._filter = action_filter
+        self._filter, self.look = action_filter, action_filter.look
         self._watch = watch
         self._low = np.array(manifest.action_low, np.float64)
         self._high = np.array(manifest.action_high, np.float64)

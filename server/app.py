@@ -1,16 +1,17 @@
-"""The HTTP service: decisions, what tells of itself, health checks, and what an operator asks and says."""
+"""The HTTP service: decisions, what tells of itself, health checks, a page, what operators ask and say."""
 
 from __future__ import annotations
 
 import secrets
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from fastapi import FastAPI
 from fastapi.responses import JSONResponse
 from starlette.types import ASGIApp
 
+from filter import FilterConfig
 from monitor import Monitor
 from recorder import Recorder
 from server.change import Changer
@@ -20,12 +21,15 @@ from server.freshness import Freshness
 from server.guard import Guard
 from server.keeper import KEY_BYTES, Keeper
 from server.keys import ACT, BATCH, Keys
+from server.live import Hub
 from server.observer import Observer, Recording
 from server.operation import Operation
 from server.robots import RESET, robots_router
 from server.safety import Safety
 from server.schema import MAX_ROBOTS, ActReply, ActRequest, BatchReply, ModelReply
 from server.states import NOT_READY, State
+from server.static import routes
+from server.view import Views
 
 MAX_BODY = 65536
 """Most bytes of a request's body: 60 numbers and a thousand hazards fit."""
@@ -53,9 +57,11 @@ class Lifecycle:
 
     Attributes:
         draining: it is about to stop: /readyz says 503, requests are still answered.
+        at_end: called once it accepts no more connections: they end what would go on for ever.
     """
 
     draining: bool = False
+    at_end: list[Callable[[], None]] = field(default_factory=list)
 
 
 def create_app(
@@ -69,6 +75,7 @@ def create_app(
     safety: Safety | None = None,
     freshness: Freshness | None = None,
     memory_key: bytes | None = None,
+    filter_config: FilterConfig | None = None,
     around: Callable[[ASGIApp], ASGIApp] | None = None,
 ) -> Guard:
     """The service around one monitor that is loaded and warmed up.
@@ -84,6 +91,7 @@ def create_app(
         safety: the limits within which it decides.
         freshness: shared with whoever looks for silent robots; by default one within `safety.freshness`.
         memory_key: seals the robots' memories, see `Keeper`; None: one made at random.
+        filter_config: the filter's settings; None: the defaults.
         around: what stands between the guard and the service, if anything does.
     """
     state = lifecycle or Lifecycle()
@@ -132,7 +140,12 @@ def create_app(
         told = {"why": watched.states.why} if status in (State.DEGRADED, State.HOLD) else {}
         return JSONResponse({"status": status} | told, 503 if status in NOT_READY else 200)
 
-    observers: list[Observer] = [watched.tally]
+    facts = model.model_dump(include={"model", "task", "gate", "threshold", "guide"})
+    facts["full_thrust"] = monitor.robot.force_limit
+    hub = Hub(Views(monitor, filter_config or FilterConfig()), watched, facts)
+    state.at_end.append(hub.close)
+    app.router.routes.extend(routes(hub))
+    observers: list[Observer] = [watched.tally, hub]
     if recorder is not None:
         observers.append(Recording(recorder, model))
     keeper = Keeper(memory_key or secrets.token_bytes(KEY_BYTES), monitor.faults)

@@ -11,19 +11,21 @@ from typing import Any
 
 ACT, BATCH, STREAM = "/act", "/act/batch", "/act/stream"
 MODEL, HOLD, RESUME, ALARMS = "/model", "/hold", "/resume", "/alarms"
-OPEN_PATHS = frozenset({"/healthz", "/readyz"})
-"""What an orchestrator may ask without a key."""
+HOME, PAGE = "/", "/page/"
+"""The live page, and what its files' paths begin with: they hold no secret."""
+OPEN_PATHS = frozenset({"/healthz", "/readyz", HOME})
+"""What an orchestrator, and a browser that was not told a key yet, may ask without one."""
 
 
 class Level(IntEnum):
     """What somebody may do; each includes those before it."""
 
     NOTHING = 0
-    """Ask whether the service is alive and ready."""
+    """Ask whether the service is alive and ready; load the live page, which then asks for a key."""
     READ = 1
     """Look at it: whatever is a GET."""
     ACT = 2
-    """Ask for decisions."""
+    """Ask for decisions, and acknowledge alarms."""
     ADMIN = 3
     """Change it: whatever else is no GET."""
 
@@ -35,7 +37,7 @@ def needed(scope: Mapping[str, Any]) -> Level:
         return Level.ACT
     if path.startswith(f"{ALARMS}/"):
         return Level.ACT  # whoever drives robots says that an alarm was seen
-    if path in OPEN_PATHS:
+    if path in OPEN_PATHS or path.startswith(PAGE):
         return Level.NOTHING
     return Level.READ if scope.get("method", "GET") in ("GET", "HEAD") else Level.ADMIN
 

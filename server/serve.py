@@ -63,7 +63,7 @@ class ServeError(ValueError):
 
 @dataclass(frozen=True)
 class ServeConfig:
-    """Serves a bundle: POST /act, GET /model, /healthz, /readyz.
+    """Serves a bundle: POST /act, GET /model, /healthz, /readyz, and a live page at /.
 
     When it listens it prints one line of JSON with its url. Ctrl-C or SIGTERM lets it finish what is in
     flight; a second one stops it at once.
@@ -324,6 +324,12 @@ class DrainingServer(uvicorn.Server):
         self._lifecycle.draining = True
         self._stop_at = time.monotonic() + self._drain_seconds
 
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """Closes the door, and then waits for what is in flight."""
+        for end in self._lifecycle.at_end:
+            end()
+        await super().shutdown(sockets)
+
     async def on_tick(self, counter: int) -> bool:
         """Asked ten times a second whether to stop."""
         self._door.sweep(asyncio.get_running_loop().time())
@@ -523,6 +529,7 @@ def serve(config: ServeConfig, place: Place | None = None) -> None:
                 safety=safety,
                 freshness=freshness,
                 memory_key=memory_key,
+                filter_config=config.filter_config(),
                 around=None if place is None else place.crew.around,
             )
             # What is loaded stays: looking through it again and again for garbage would hold up decisions.

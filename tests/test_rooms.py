@@ -29,6 +29,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "recorder": set(),
     "server": {
         *("command", "decision", "monitor", "models", "filter", "guide", "recorder", "pointgoal.observation"),
+        *("system.outlook", "system.point_robot"),
     },
     "evaluation": {
         *(
