@@ -240,7 +240,7 @@ class Alike:
         """Handles one connection."""
         if scope["type"] == "http" and (scope["method"], scope["path"]) not in ANY_WORKER | HEALTH:
             await _answer(send, _refusal(scope, "one of the replicas alone"))
-        else:
+        else:  # a stream, or one of these
             await self._app(scope, receive, send)
 
 

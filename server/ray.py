@@ -19,6 +19,9 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
+from starlette.applications import Starlette
+from starlette.types import ASGIApp, Receive, Scope, Send
+
 from command import command, settings
 from models import BundleError
 from monitor import Monitor, MonitorError
@@ -82,9 +85,26 @@ class RayConfig(ServeConfig):
             raise ServeError(f"--ongoing must be above 0, got {self.ongoing}")
 
 
+class Replicated:
+    """A replica's service, which has nothing to do when Ray says that it begins or ends.
+
+    Args:
+        guard: the service.
+    """
+
+    def __init__(self, guard: Guard) -> None:
+        self._guard = guard
+        self._lifespan = Starlette()
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Handles one connection."""
+        app: ASGIApp = self._lifespan if scope["type"] == "lifespan" else self._guard
+        await app(scope, receive, send)
+
+
 def replica(
     files: Mapping[str, bytes], config: RayConfig, keys: Keys, memory_key: bytes
-) -> tuple[Monitor, Guard]:
+) -> tuple[Monitor, ASGIApp]:
     """What one replica runs: the monitor, warmed up, and the service around it.
 
     Args:
@@ -102,9 +122,10 @@ def replica(
     safety = config.safety()
     # A robot's requests come to any of the replicas.
     safety = replace(safety, freshness=replace(safety.freshness, alone=False))
-    return monitor, create_app(
+    guard = create_app(
         monitor, None, keys, config.max_body, safety=safety, memory_key=memory_key, around=Alike
     )
+    return monitor, Replicated(guard)
 
 
 def application(config: RayConfig, keys: Keys, memory_key: bytes) -> Any:
@@ -129,7 +150,7 @@ def application(config: RayConfig, keys: Keys, memory_key: bytes) -> Any:
         def __init__(self, *orders: Any) -> None:
             self._monitor, self._service = replica(*orders)
 
-        def __serve_build_asgi_app__(self) -> Guard:
+        def __serve_build_asgi_app__(self) -> ASGIApp:
             return self._service
 
         def check_health(self) -> None:

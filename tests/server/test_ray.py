@@ -65,7 +65,9 @@ def test_a_replica_answers_what_the_service_does(monitor, tiny_bundle: Path, obs
     files = {path.name: path.read_bytes() for path in tiny_bundle.iterdir()}
     config = RayConfig(Path("/elsewhere") / tiny_bundle.name, gate="always")
     mine, app = make_replica(files, config, Keys(act="sesame"), bytes(32))
-    service, plain = TestClient(app), TestClient(create_app(monitor))
+    plain = TestClient(create_app(monitor))
+    with TestClient(app) as service:  # Ray says that it begins, and that it ends
+        pass
     asked = {"observation": observation}
     assert service.post("/act", json=asked).status_code == 401
     replies = [
