@@ -30,8 +30,7 @@ from rich.table import Table
 
 from benchmarks.server import Connection, cases, full_memory
 from evaluation.service import Service
-from models import Bundle
-from monitor import GateName
+from monitor import GateName, Monitor
 from pointgoal.observation import layout
 from server.keeper import KEY_BYTES
 
@@ -125,8 +124,8 @@ def alternate(
 
 def run(config: RecordingBenchmark) -> tuple[dict[str, dict[str, Measured]], dict[str, Any], float]:
     """What was measured by case and service; how the recorder stands at the end; bytes a decision."""
-    bundle = Bundle.load(config.bundle)
-    level, key = bundle.manifest.level, secrets.token_bytes(KEY_BYTES)
+    monitor = Monitor.load(config.bundle, config.gate)
+    level, key = monitor.bundle.manifest.level, secrets.token_bytes(KEY_BYTES)
     command = [sys.executable, "-m", "server.serve", str(config.bundle), "--port", "0", "--gate", config.gate]
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
         key_file = Path(folder, "key")
@@ -138,7 +137,7 @@ def run(config: RecordingBenchmark) -> tuple[dict[str, dict[str, Measured]], dic
         }
         measured = {
             name: alternate(services, bodies(level, case.asked), config)
-            for name, case in cases(level, full_memory(bundle.id, key)).items()
+            for name, case in cases(level, full_memory(monitor, key)).items()
         }
         time.sleep(1.0)
         with urlopen(f"{services['with'].url}/healthz") as reply:

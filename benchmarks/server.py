@@ -1,4 +1,4 @@
-"""Latency and throughput of `POST /act` beside a bare FastAPI echo of the same body, and the call in process.
+"""Latency of `POST /act` and `WS /act/stream` beside a bare FastAPI echo of the same body, and in process.
 
     python -m benchmarks.server models/NAME
 
@@ -23,6 +23,7 @@ from tempfile import NamedTemporaryFile
 from typing import Annotated, Any
 from urllib.parse import urlsplit
 
+import msgpack
 import numpy as np
 import tyro
 import uvicorn
@@ -36,9 +37,11 @@ from evaluation.service import Service
 from monitor import GateName, Monitor
 from pointgoal.lidar import encode
 from pointgoal.observation import layout
+from server.duty import OnDuty
 from server.keeper import KEY_BYTES, Keeper, Past
 from server.keys import Keys
 from server.serve import listen
+from server.stream import BINARY, TEXT, frame
 
 
 class Echo(BaseModel):
@@ -110,9 +113,46 @@ class Connection:
         return part
 
 
+class Stream(Connection):
+    """One `WS /act/stream` that sends the same frames again and again, in turn."""
+
+    def __init__(self, url: str, *bodies: bytes) -> None:
+        address = urlsplit(url)
+        self._socket = socket.create_connection((address.hostname, address.port))
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._socket.sendall(
+            f"GET {address.path} HTTP/1.1\r\nhost: {address.netloc}\r\nconnection: upgrade\r\n"
+            "upgrade: websocket\r\nsec-websocket-version: 13\r\n"
+            "sec-websocket-key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n".encode()
+        )
+        if b" 101 " not in self._receive():
+            raise RuntimeError("the service opens no stream")
+        packed = address.fragment == "msgpack"
+        self._requests = cycle(
+            [frame(BINARY, msgpack.packb(json.loads(b))) if packed else frame(TEXT, b) for b in bodies]
+        )
+
+    def exchange(self) -> bytes:
+        """One frame each way: what the reply holds."""
+        self._socket.sendall(next(self._requests))
+        reply = self._receive()
+        # 126 says that two bytes of length follow: no reply is shorter, and none longer than they can say.
+        if reply[1] != 126:
+            raise RuntimeError("no reply has this length")
+        length = 4 + int.from_bytes(reply[2:4])
+        while len(reply) < length:
+            reply += self._receive()
+        return reply[4:]
+
+
+def connect(url: str, *bodies: bytes) -> Connection:
+    """A connection that sends some bodies: a stream for "ws://", of msgpack with "#msgpack" behind it."""
+    return (Stream if url.startswith("ws") else Connection)(url, *bodies)
+
+
 def throughput(url: str, body: bytes, connections: int, requests: int) -> float:
     """Requests a second over several connections at once."""
-    opened = [Connection(url, body) for _ in range(connections)]
+    opened = [connect(url, body) for _ in range(connections)]
     threads = [threading.Thread(target=connection.times, args=(requests,)) for connection in opened]
     started = time.perf_counter()
     for thread in threads:
@@ -166,12 +206,12 @@ def cases(level: int, memory: str) -> dict[str, Case]:
     }
 
 
-def full_memory(model: str, key: bytes) -> str:
+def full_memory(monitor: Monitor, key: bytes) -> str:
     """A memory with a whole plan, as the service of a key sends it."""
     memory = np.zeros(1, MEMORY)
     memory["side"], memory["planned"], memory["left"] = 5, True, PLAN_STEPS
     memory["plan"] = (0.05, 0.5)
-    return Keeper(key, Faults()).seal(memory[0], None, model, Past(None, None, None))
+    return Keeper(key, Faults()).seal(memory[0], None, OnDuty.of(monitor).robot, Past(None, None, None))
 
 
 def in_process(monitor: Monitor, asked: dict[str, Any], calls: int) -> tuple[float, float]:
@@ -188,9 +228,11 @@ def in_process(monitor: Monitor, asked: dict[str, Any], calls: int) -> tuple[flo
 
 def over_http(url: str, case: Case, config: ServerBenchmark) -> list[float]:
     """Median and 99th percentile [µs], and requests a second at each number of clients."""
-    connection = Connection(url, case.body)
-    if case.mode is not None and (mode := json.loads(connection.exchange())["mode"]) != case.mode:
-        raise RuntimeError(f"the decision is {mode}, expected {case.mode}")
+    connection = connect(url, case.body)
+    if case.mode is not None:
+        read = msgpack.unpackb if url.endswith("#msgpack") else json.loads
+        if (mode := read(connection.exchange())["mode"]) != case.mode:
+            raise RuntimeError(f"{url}: the decision is {mode}, expected {case.mode}")
     connection.times(50)
     p50, p99 = np.percentile(connection.times(config.requests), [50, 99]) * 1e6
     connection.close()
@@ -202,7 +244,7 @@ def run(config: ServerBenchmark) -> dict[str, list[float]]:
     """Starts both services, measures them in turn, stops them; the medians over rounds."""
     monitor = Monitor.load(config.bundle, config.gate)
     key = secrets.token_bytes(KEY_BYTES)
-    measured = cases(monitor.bundle.manifest.level, full_memory(monitor.bundle.id, key))
+    measured = cases(monitor.bundle.manifest.level, full_memory(monitor, key))
     seen: dict[str, list[list[float]]] = {}
     with ExitStack() as stack:
         file = stack.enter_context(NamedTemporaryFile())
@@ -219,9 +261,13 @@ def run(config: ServerBenchmark) -> dict[str, list[float]]:
                 seen.setdefault(f"in process: {name}", []).append(
                     [*in_process(monitor, case.asked, config.requests), *[math.nan] * len(config.clients)]
                 )
-                seen.setdefault(f"POST /act: {name}", []).append(
-                    over_http(f"{service.url}/act", case, config)
-                )
+                stream = f"{service.url.replace('http', 'ws')}/act/stream"
+                for kind, url in (
+                    ("POST /act", f"{service.url}/act"),
+                    ("stream, JSON", stream),
+                    ("stream, msgpack", f"{stream}#msgpack"),
+                ):
+                    seen.setdefault(f"{kind}: {name}", []).append(over_http(url, case, config))
     return {name: np.median(rows, axis=0).tolist() for name, rows in seen.items()}
 
 

@@ -200,7 +200,7 @@ class Desk:
         asked, past = self._read(now, lambda: codec.read(content))
         decision = self._undecided(now, asked, past, arrived, late)
         if decision is None:
-            decision = now.decider.decide_lost(asked.observation, asked.hazards, past.memory, past.lost)
+            decision = _decision(now, asked, past)
         return self._told(now, decision, asked, past, started), [asked], [decision]
 
     def _decide_batch(
@@ -220,7 +220,7 @@ class Desk:
                 continue
             decision = self._undecided(now, asked, past, arrived, late)
             if decision is None and past.lost is not None:
-                decision = now.decider.decide_lost(asked.observation, asked.hazards, past.memory, past.lost)
+                decision = _decision(now, asked, past)
             if decision is None:
                 rows.append((place, asked, past))
             else:
@@ -281,6 +281,12 @@ class Desk:
         memory = self._keeper.seal(decision.memory, asked.robot, now.robot, past)
         seconds = time.perf_counter() - started
         return reply_of(decision, memory, asked.request, now.model.model, now.model.gate, seconds)
+
+
+def _decision(now: OnDuty, asked: ActRequest, past: Past) -> Decision:
+    if past.lost is None:
+        return now.decider.decide(asked.observation, asked.hazards, past.memory)
+    return now.decider.decide_lost(asked.observation, asked.hazards, past.memory, past.lost)
 
 
 def _hazards(given: list[list[list[float]]]) -> FloatArray:

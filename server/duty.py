@@ -59,9 +59,9 @@ class Held:
         return self._hold(memory_of(1, memory))[0]
 
     def decide_lost(
-        self, observation: ArrayLike, hazards: ArrayLike | None, memory: Any, lost: str | None
+        self, observation: ArrayLike, hazards: ArrayLike | None, memory: Any, lost: str
     ) -> Decision:
-        """The safe decision for a robot whose memory is ``lost``, or None if it is not."""
+        """The safe decision for a robot whose memory is ``lost``."""
         return self.decide(observation, hazards, memory)
 
     def decide_batch(

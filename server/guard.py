@@ -55,6 +55,9 @@ class Guard:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Handles one connection."""
+        if scope["type"] not in ("http", "websocket"):
+            await self._app(scope, receive, send)
+            return
         headers: dict[bytes, bytes] = dict(scope["headers"])
         if scope["type"] == "websocket":
             await self._stream(headers, scope, receive, send)

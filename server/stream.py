@@ -18,7 +18,7 @@ from server.link import MAX_REPLY, Connected, Link, remaining
 _MAGIC = b"258EAFA5-E914-47DA-95CA-C5AB0DC85B11"
 """RFC 6455, section 1.3."""
 _STATUS = b'{"status":'
-_TEXT, _PING, _PONG = 0x1, 0x9, 0xA
+TEXT, BINARY, _PING, _PONG = 0x1, 0x2, 0x9, 0xA
 _FINAL = 0x80
 _LONGEST_CONTROL = 125
 
@@ -49,13 +49,13 @@ class StreamLink(Link):
         """One frame each way."""
         opened.deadline, opened.allowance = deadline, MAX_REPLY
         opened.settimeout(remaining(deadline))
-        opened.sendall(_frame(_TEXT, body))
+        opened.sendall(frame(TEXT, body))
         while True:
             kind, content = _read_frame(opened)
             if kind == _PING:
                 opened.settimeout(remaining(deadline))
-                opened.sendall(_frame(_PONG, content))
-            elif kind == _TEXT:
+                opened.sendall(frame(_PONG, content))
+            elif kind == TEXT:
                 return _status_of(content), content
             elif kind != _PONG:
                 raise http.client.HTTPException("the service closed the stream")
@@ -78,7 +78,7 @@ def _head(opened: Connected) -> tuple[int, dict[str, str]]:
         response.close()
 
 
-def _frame(kind: int, content: bytes) -> bytes:
+def frame(kind: int, content: bytes) -> bytes:
     """A whole frame; a client's are masked (RFC 6455, section 5.3)."""
     size = len(content)
     if size <= _LONGEST_CONTROL:

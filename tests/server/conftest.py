@@ -18,6 +18,7 @@ from decision import MEMORY, Faults
 from monitor import Monitor
 from pointgoal.lidar import encode
 from server.app import create_app
+from server.duty import OnDuty
 from server.keeper import Keeper, Past
 from server.schema import ModelReply
 
@@ -29,18 +30,21 @@ def monitor(tiny_bundle: Path) -> Monitor:
 
 
 @pytest.fixture
-def app(monitor: Monitor) -> TestClient:
+def app(monitor: Monitor, memory_key: bytes) -> TestClient:
     """The service in this process; what it raises, the test sees."""
-    return TestClient(create_app(monitor, memory_key=KEY))
+    return TestClient(create_app(monitor, memory_key=memory_key))
 
 
-KEY = b"k" * 32
+@pytest.fixture(scope="session")
+def memory_key() -> bytes:
+    """By which `sealed` seals."""
+    return b"k" * 32
 
 
 @pytest.fixture
-def sealed(monitor: Monitor) -> Callable[..., str]:
-    """Seals a memory with a plan, and other fields, as the service `app` does for a robot."""
-    keeper = Keeper(KEY, Faults())
+def sealed(monitor: Monitor, memory_key: bytes) -> Callable[..., str]:
+    """Seals a memory with a plan, and other fields, as a service with `memory_key` does for a robot."""
+    keeper, kind = Keeper(memory_key, Faults()), OnDuty.of(monitor).robot
 
     def seal(plan: list[list[float]], robot: str | None = None, **fields: int) -> str:
         memory = np.zeros(1, MEMORY)
@@ -48,7 +52,7 @@ def sealed(monitor: Monitor) -> Callable[..., str]:
         memory["plan"][0, : len(plan)] = np.reshape(plan, (-1, 2))
         for name, value in fields.items():
             memory[name] = value
-        return keeper.seal(memory[0], robot, monitor.bundle.id, Past(None, None, None))
+        return keeper.seal(memory[0], robot, kind, Past(None, None, None))
 
     return seal
 

@@ -684,7 +684,7 @@ def test_a_reply_garbled_anywhere_is_survived(wired, monitor, observation) -> No
         wired(reply)
         decision = client.decide(observation, memory=planned())
         assert (np.abs(decision.action) <= 1.0).all()
-        assert (np.abs(decision.memory["plan"]) <= 1.0).all()
+        assert (np.abs(decision.plan) <= 1.0).all()
         if decision.reason is not None:
             assert decision.action.tolist() == PLAN[0]
         nominal += decision.reason is None

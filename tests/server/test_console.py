@@ -38,9 +38,10 @@ def operation(monitor: Monitor) -> Operation:
 
 
 @pytest.fixture
-def service(operation: Operation) -> TestClient:
+def service(operation: Operation, memory_key: bytes) -> TestClient:
     monitor = operation.duty.now.monitor
-    return TestClient(create_app(monitor, operation=operation, keys=KEYS, max_body=20_000), headers=ROBOT)
+    app = create_app(monitor, operation=operation, keys=KEYS, max_body=20_000, memory_key=memory_key)
+    return TestClient(app, headers=ROBOT)
 
 
 def scrape(service: TestClient) -> dict[tuple[str, ...], float]:
@@ -143,9 +144,9 @@ def test_kinds_of_faults_are_bounded(service, operation) -> None:
     assert kind_of("some error") == OTHER == "fault"
 
 
-def test_a_hold_plays_the_plan_then_coasts_until_it_is_lifted(service, observation) -> None:
+def test_a_hold_plays_the_plan_then_coasts_until_it_is_lifted(service, observation, sealed) -> None:
     plan = [[0.5, 0.25], [-0.5, 0.0]]
-    memory = {"side": 0, "guided": 0, "open": 0, "plan": plan}
+    memory = sealed(plan)
     body = {"observation": observation, "memory": memory}
     mode = service.post("/act", json=body).json()["mode"]
     assert mode != "fallback"
@@ -168,7 +169,9 @@ def test_a_hold_plays_the_plan_then_coasts_until_it_is_lifted(service, observati
     assert seen["alarm", "fallbacks", "clear"] == 1.0
     assert service.post("/resume").status_code == 403
     assert service.post("/resume", headers=ADMIN).json()["state"] == "ready"
-    assert service.post("/act", json={"observation": observation, "memory": memory}).json()["mode"] == mode
+    assert (
+        service.post("/act", json={"observation": observation, "memory": sealed(plan)}).json()["mode"] == mode
+    )
     assert service.post("/resume", headers=ADMIN).status_code == 409
 
 

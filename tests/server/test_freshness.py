@@ -17,7 +17,7 @@ from server.keys import Keys
 from server.safety import Safety
 
 STEP = 0.02
-MEMORY = {"side": 0, "guided": 0, "open": 0, "plan": [[0.05, -1.0], [0.03, 0.0]]}
+PLAN = [[0.05, -1.0], [0.03, 0.0]]
 
 
 def learned(clock: Clock, epoch: float = 0.0, delay: float = 0.001, start: float = 1000.0) -> float:
@@ -231,30 +231,32 @@ def test_late_and_missing_requests_are_counted_and_silence_is_noted() -> None:
 
 
 @pytest.fixture
-def strict(monitor) -> TestClient:
+def strict(monitor, memory_key) -> TestClient:
     """The service, with keys and a limit of 100 ms, which holds at once."""
     limits = Limits(max_age=0.1, hold_after=1e-6)
     keys = Keys(act="act", admin="admin")
-    return TestClient(create_app(monitor, keys=keys, safety=Safety(freshness=limits)))
+    return TestClient(create_app(monitor, keys=keys, safety=Safety(freshness=limits), memory_key=memory_key))
 
 
 ACT, ADMIN = ({"x-api-key": key} for key in ("act", "admin"))
 
 
-def test_the_plan_goes_on_then_the_robot_stops_and_an_operator_frees_it(strict, monitor, observation) -> None:
+def test_the_plan_goes_on_then_the_robot_stops_and_an_operator_frees_it(
+    strict, monitor, observation, sealed
+) -> None:
     before = monitor.faults.counts.copy()
     body = {"observation": observation, "robot": "r2", "stamp": 50.0}
     assert strict.post("/act", json=body, headers=ACT).json()["reason"] is None
-    old = body | {"stamp": 49.0, "memory": MEMORY}
-    for action in (*MEMORY["plan"], [0.0, 0.0]):
+    old = body | {"stamp": 49.0, "memory": sealed(PLAN, "r2")}
+    for action in (*PLAN, [0.0, 0.0]):
         content = strict.post("/act", json=old, headers=ACT).json()
         assert (content["mode"], content["origin"], content["action"]) == ("fallback", "plan", action)
         assert "goes back by 1 s" in content["reason"]
         old["memory"] = content["memory"]
     # Whoever sends the same memory again and again does not drive on by it.
-    old["memory"] = MEMORY
+    old["memory"] = sealed(PLAN, "r2")
     actions = [strict.post("/act", json=old, headers=ACT).json()["action"] for _ in range(PLAN_STEPS + 1)]
-    assert actions[0] == MEMORY["plan"][0]
+    assert actions[0] == PLAN[0]
     assert actions[-1] == [0.0, 0.0]
     counts = monitor.faults.counts - before
     assert counts["hold"] > 20
@@ -267,11 +269,15 @@ def test_the_plan_goes_on_then_the_robot_stops_and_an_operator_frees_it(strict, 
     assert strict.post("/act", json=body | {"stamp": 2.0}, headers=ACT).json()["reason"] is None
 
 
-def test_a_batch_decides_about_the_fresh_ones(strict, observation) -> None:
+def test_a_batch_decides_about_the_fresh_ones(strict, observation, sealed) -> None:
     body = {"observation": observation, "stamp": 50.0}
-    robots = [body | {"robot": "r0"}, {"observation": observation, "memory": MEMORY}, body | {"robot": "r2"}]
+    robots = [
+        body | {"robot": "r0"},
+        {"observation": observation, "memory": sealed(PLAN)},
+        body | {"robot": "r2"},
+    ]
     first, second, third = strict.post("/act/batch", json={"robots": robots}, headers=ACT).json()["replies"]
-    assert (second["mode"], second["action"]) == ("fallback", MEMORY["plan"][0])
+    assert (second["mode"], second["action"]) == ("fallback", PLAN[0])
     assert "`robot` is missing" in second["reason"]
     for told in (first, third):
         assert told["reason"] is None

@@ -18,7 +18,6 @@ from server.hands import MOST_HUNG, Hands, LateError
 from server.safety import Safety
 
 PLAN = [[0.05, -1.0], [0.03, 0.0]]
-MEMORY = {"side": 0, "guided": 0, "open": 0, "plan": PLAN}
 
 
 def hanging(gate: threading.Event) -> Callable[[], str]:
@@ -126,18 +125,22 @@ class Hanging(Monitor):
 
 
 @contextmanager
-def limited(monitor: Monitor, **limits: object) -> Iterator[tuple[TestClient, Hanging]]:
+def limited(
+    monitor: Monitor, key: bytes | None = None, **limits: object
+) -> Iterator[tuple[TestClient, Hanging]]:
     slow = Hanging(monitor)
-    with TestClient(create_app(slow, safety=Safety(**limits))) as app:
+    with TestClient(create_app(slow, safety=Safety(**limits), memory_key=key)) as app:
         try:
             yield app, slow
         finally:
             slow.gate_of_time.set()
 
 
-def test_past_the_deadline_the_plan_goes_on_and_then_the_robot_stops(monitor, observation) -> None:
-    with limited(monitor, deadline=0.1) as (app, slow):
-        hung = {"observation": [9.0, *observation[1:]], "memory": MEMORY}
+def test_past_the_deadline_the_plan_goes_on_and_then_the_robot_stops(
+    monitor, observation, sealed, memory_key
+) -> None:
+    with limited(monitor, memory_key, deadline=0.1) as (app, slow):
+        hung = {"observation": [9.0, *observation[1:]], "memory": sealed(PLAN)}
         actions = []
         for _ in range(MOST_HUNG + 2):
             content = app.post("/act", json=hung).json()
@@ -155,10 +158,10 @@ def test_past_the_deadline_the_plan_goes_on_and_then_the_robot_stops(monitor, ob
         assert app.get("/healthz").status_code == 200
 
 
-def test_a_batch_past_the_deadline(monitor, observation) -> None:
-    with limited(monitor, deadline=0.1) as (app, _):
+def test_a_batch_past_the_deadline(monitor, observation, sealed, memory_key) -> None:
+    with limited(monitor, memory_key, deadline=0.1) as (app, _):
         robots = [
-            {"observation": [9.0, *observation[1:]], "memory": MEMORY, "request": 1},
+            {"observation": [9.0, *observation[1:]], "memory": sealed(PLAN), "request": 1},
             {"observation": observation[1:]},
             {"observation": observation, "request": 3},
         ]

@@ -18,8 +18,8 @@ from monitor import Monitor
 from pointgoal.observation import layout
 from server import keeper as module
 from server.desk import Desk
+from server.duty import Duty
 from server.keeper import Keeper, Past
-from server.schema import ModelReply
 
 KEY = b"k" * 32
 NOBODY = Past(None, None, None)
@@ -208,7 +208,7 @@ def ask(desk: Desk, observation: np.ndarray, bodies: list[dict[str, Any]]) -> li
 
 
 def desk_of(monitor: Monitor) -> Desk:
-    return Desk(None, monitor, ModelReply.of(monitor), Keeper(KEY, monitor.faults))
+    return Desk(None, Duty(monitor), Keeper(KEY, monitor.faults))
 
 
 @pytest.mark.parametrize(("robots", "steps"), [(12, 120), pytest.param(200, 1000, marks=pytest.mark.long)])
