@@ -29,7 +29,6 @@ from benchmarks.recording import RecordingBenchmark, bodies, slower, times
 from benchmarks.server import Connection, cases, full_memory
 from evaluation.service import Service
 from filter import FilterConfig
-from models import Bundle
 from monitor import Monitor
 from server.keeper import KEY_BYTES
 from server.live import Hub
@@ -70,8 +69,8 @@ def watched(url: str) -> Iterator[None]:
 
 def run(config: LiveBenchmark) -> dict[str, dict[str, FloatArray]]:
     """Case → "alone" and "watched" → time of each request [µs], (rounds, requests)."""
-    bundle = Bundle.load(config.bundle)
-    level, key = bundle.manifest.level, secrets.token_bytes(KEY_BYTES)
+    monitor = Monitor.load(config.bundle, config.gate)
+    level, key = monitor.bundle.manifest.level, secrets.token_bytes(KEY_BYTES)
     measured = {}
     with ExitStack() as stack:
         file = stack.enter_context(NamedTemporaryFile())
@@ -80,7 +79,7 @@ def run(config: LiveBenchmark) -> dict[str, dict[str, FloatArray]]:
         service = stack.enter_context(
             Service.start(config.bundle, config.gate, None, "--memory-key-file", file.name)
         )
-        for name, case in cases(level, full_memory(bundle.id, key)).items():
+        for name, case in cases(level, full_memory(monitor, key)).items():
             connection = Connection(f"{service.url}/act", *bodies(level, case.asked))
             connection.times(500)
             taken: dict[str, list[list[float]]] = {"alone": [], "watched": []}

@@ -79,11 +79,11 @@ class Desk:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Handles one request, or one stream of them."""
-        path = scope["path"]
         if scope["type"] == "websocket":
             await self._stream(scope, receive, send)
             return
-        if scope["type"] != "http" or path not in (ACT, BATCH) or scope["method"] != "POST":
+        path = scope["path"] if scope["type"] == "http" else None
+        if path not in (ACT, BATCH) or scope["method"] != "POST":
             await self._app(scope, receive, send)
             return
         started = time.perf_counter()

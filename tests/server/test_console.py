@@ -155,8 +155,10 @@ def test_a_hold_plays_the_plan_then_coasts_until_it_is_lifted(service, observati
     assert service.post("/hold", headers=ADMIN).json() == reply.json()
     assert (service.get("/readyz").status_code, service.get("/readyz").json()["status"]) == (200, "hold")
     assert service.get("/healthz").json()["state"] == "hold"
+    body["memory"] = sealed(plan)
     batch = service.post("/act/batch", json={"robots": [body, {"observation": observation}]}).json()
     assert [one["action"] for one in batch["replies"]] == [plan[0], [0.0, 0.0]]
+    body["memory"] = sealed(plan)
     for expected in (*plan, [0.0, 0.0], [0.0, 0.0]):
         told = service.post("/act", json=body).json()
         assert (told["action"], told["mode"]) == (expected, Mode.FALLBACK)
