@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
+import os
 import secrets
 import signal
 import socket
@@ -135,7 +136,7 @@ class Supervisor:
         assert process.stdin is not None
         process.stdin.write(ORDER.dump_json(self._orders[number]) + b"\n")
         if self._stop.is_set():  # meanwhile
-            process.terminate()
+            _send(process, signal.SIGTERM)
         return process
 
     async def _keep(self, number: int) -> None:
@@ -174,7 +175,7 @@ class Supervisor:
             silent = silent + 1 if await ask(place, "/healthz") is None else 0
         if not self._stop.is_set() and self._running[number] is process:
             _LOG.error("worker %d does not answer and is killed", number)
-            process.kill()
+            _send(process, signal.SIGKILL)
 
     async def _renew(self) -> None:
         """On SIGHUP puts a new process in the place of each worker, which drains once the new one listens.
@@ -191,8 +192,7 @@ class Supervisor:
                         _LOG.error("worker %d could not be started anew: those that run stay", number)
                         break
                     old, self._running[number] = self._running[number], process
-                with suppress(ProcessLookupError):
-                    old.terminate()
+                _send(old, signal.SIGTERM)
                 self._roster.ready = sorted({*self._roster.ready, number})
                 self._tell()
                 _LOG.warning("worker %d was started anew", number)
@@ -210,14 +210,20 @@ class Supervisor:
         # Held open here, it would take connections that nobody answers.
         self._listener.close()
         for process in self._running.values():
-            with suppress(ProcessLookupError):
-                process.terminate()
+            _send(process, signal.SIGTERM)
 
 
 async def _announcement(process: Process) -> bytes:
     """What a worker says when it listens; nothing if it ended before."""
     assert process.stdout is not None
     return await process.stdout.readline()
+
+
+def _send(process: Process, number: signal.Signals) -> None:
+    """Sends a signal. asyncio's own way might reap the process before asyncio learns how it ended."""
+    if process.returncode is None:
+        with suppress(ProcessLookupError):
+            os.kill(process.pid, number)
 
 
 def _how(status: int) -> str:

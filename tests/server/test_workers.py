@@ -239,7 +239,7 @@ def test_what_cannot_be_served_is_one_line() -> None:
     command = [*COMMAND, "/none", "--port", "0", "--workers", "2"]
     result = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert (result.returncode, result.stdout) == (2, "")
-    assert len(result.stderr.strip().splitlines()) == 1
+    assert len(result.stderr.strip().splitlines()) == 1, result.stderr
     assert "no such bundle" in result.stderr
 
 
