@@ -88,7 +88,8 @@ def test_robots_drive_on_while_one_worker_after_the_other_is_killed(service: Ser
             os.kill(first, signal.SIGKILL)
         if steps == 600:
             # Not before the first one is back: somebody has to answer.
-            until(lambda: len(get(service, "/healthz")[1]["ready"]) == 2)
+            until(lambda: get(service, "/healthz")[1]["restarts"] == 1)
+            until(lambda: get(service, "/healthz")[1]["ready"] == [1, 2])
             os.kill(second, signal.SIGKILL)
 
     with Fleet(service.url, timeout=1.0) as fleet:
@@ -97,7 +98,8 @@ def test_robots_drive_on_while_one_worker_after_the_other_is_killed(service: Ser
     # Each robot has lost at most the requests that were under way; then another worker had it.
     assert len([reason for reason in episodes.reasons if reason.startswith("service")]) <= 4
     assert episodes.reasons
-    until(lambda: len(get(service, "/healthz")[1]["ready"]) == 2)
+    until(lambda: get(service, "/healthz")[1]["restarts"] == 2)
+    until(lambda: get(service, "/healthz")[1]["ready"] == [1, 2])
     status, after = get(service, "/healthz")
     assert (status, after["restarts"], len(after["each"])) == (200, 2, 2)
     assert after["last"] == "worker 2 was killed by SIGKILL"
@@ -170,11 +172,11 @@ def test_a_worker_that_hangs_is_replaced_and_no_robot_waits_for_it(tiny_bundle: 
     with started(tiny_bundle) as service:
         hung, _ = children(service)
         os.kill(hung, signal.SIGSTOP)
-        answered = []
+        answered: list[bool] = []
         until(lambda: answered.append(decided(service, observation)) or gone(hung))
         assert answered.count(True) >= 1
-        until(lambda: len(get(service, "/healthz")[1]["ready"]) == 2)
-        assert get(service, "/healthz")[1]["last"] == "worker 1 was killed by SIGKILL"
+        until(lambda: get(service, "/healthz")[1]["last"] == "worker 1 was killed by SIGKILL")
+        until(lambda: get(service, "/healthz")[1]["ready"] == [1, 2])
         assert "worker 1 does not answer and is killed" in service.complaints()
 
 
