@@ -16,7 +16,7 @@ setup: $(VENV)/.installed ## install everything into .venv
 $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit("Python 3.11 or newer is needed, this is " + sys.version.split()[0] if sys.version_info < (3, 11) else 0)'
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[train,sweep,test]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[train,sweep,fleet,test]'
 	@# Loading a bundle compiles the filter; its machine code is kept beside the source.
 	$(BIN)/python -c 'from monitor import Monitor; Monitor.load("$(BUNDLE)")'
 	touch $@
@@ -46,6 +46,7 @@ benchmark: setup ## every measurement, one after the other
 	$(BIN)/python -m benchmarks.server $(BUNDLE)
 	$(BIN)/python -m benchmarks.recording $(BUNDLE)
 	$(BIN)/python -m benchmarks.live $(BUNDLE)
+	$(BIN)/python -m benchmarks.fleet $(BUNDLE) --ray
 
 clean: ## remove what make made
 	rm -rf $(VENV) demo build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis

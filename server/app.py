@@ -9,6 +9,7 @@ from typing import Any
 
 from fastapi import FastAPI
 from fastapi.responses import JSONResponse
+from starlette.types import ASGIApp
 
 from filter import FilterConfig
 from monitor import Monitor
@@ -75,6 +76,7 @@ def create_app(
     freshness: Freshness | None = None,
     memory_key: bytes | None = None,
     filter_config: FilterConfig | None = None,
+    around: Callable[[ASGIApp], ASGIApp] | None = None,
 ) -> Guard:
     """The service around one monitor that is loaded and warmed up.
 
@@ -90,6 +92,7 @@ def create_app(
         freshness: shared with whoever looks for silent robots; by default one within `safety.freshness`.
         memory_key: seals the robots' memories, see `Keeper`; None: one made at random.
         filter_config: the filter's settings; None: the defaults.
+        around: what stands between the guard and the service, if anything does.
     """
     state = lifecycle or Lifecycle()
     limits = safety or Safety()
@@ -147,8 +150,10 @@ def create_app(
         observers.append(Recording(recorder, model))
     keeper = Keeper(memory_key or secrets.token_bytes(KEY_BYTES), monitor.faults)
     app.include_router(robots_router(known, keeper, _REFUSALS))
-    desk = Desk(app, duty, keeper, observers, limits, known)
-    guard = Guard(desk, keys or Keys(), max_body, {BATCH: BATCH_BODY * max_body})
+    desk: ASGIApp = Desk(app, duty, keeper, observers, limits, known)
+    guard = Guard(
+        desk if around is None else around(desk), keys or Keys(), max_body, {BATCH: BATCH_BODY * max_body}
+    )
     add_console(app, watched, changer, guard.refusals)
     return guard
 

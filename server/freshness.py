@@ -44,12 +44,15 @@ class Limits:
         hold_after: for how long a robot may go without a fresh one before it is held [s].
         silent_after: how long a robot may not ask before it counts as silent [s].
         robots: how many robots are remembered.
+        alone: whether one process answers every request of a robot. Otherwise none can follow its clock or
+            hold it, and what is stamped is not decided about.
     """
 
     max_age: float | None = None
     hold_after: float = 1.0
     silent_after: float = 1.0
     robots: int = 1024
+    alone: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,6 +156,10 @@ class Freshness:
         Returns:
             Why not, or None.
         """
+        if stamp is not None and not self.limits.alone:
+            apart = Unfit("stamp", "several processes answer, and none of them can follow a robot's clock")
+            self.note(apart.kind, apart.reason)
+            return apart
         if robot is None:
             if self.limits.max_age is None and stamp is None:
                 return None
@@ -198,6 +205,8 @@ class Freshness:
 
     def sweep(self, now: float) -> list[str]:
         """The robots that have fallen silent since the last sweep; each is noted."""
+        if not self.limits.alone:
+            return []  # they may ask another process
         with self._lock:
             fallen = [
                 (name, known)

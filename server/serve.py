@@ -14,11 +14,11 @@ import ssl
 import sys
 import time
 from contextlib import AbstractContextManager, nullcontext, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from types import FrameType
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import tyro
 import uvicorn
@@ -31,6 +31,7 @@ from recorder import Recorder, RecordingError, Settings
 from server.alarms import AlarmsError, read_rules
 from server.app import MAX_BODY, Lifecycle, create_app
 from server.change import ChangeError, Changer
+from server.crew import Crew
 from server.door import Connection, Door, Patience
 from server.events import Events, Form
 from server.freshness import Freshness, Limits
@@ -74,6 +75,9 @@ class ServeConfig:
     """Address to listen on. Beyond loopback a key is required."""
     port: int = 8000
     """Port to listen on; 0 takes a free one."""
+    workers: int = 1
+    """Processes behind the one address; one that dies is started again. What is told by each, /metrics for
+    example, is told of all; limits are each worker's, room for recordings is shared out among them."""
     gate: GateName = "risk"
     """When the filter is active: where the risk score or the barrier asks for it, always, never."""
     threshold: float | None = None
@@ -160,6 +164,12 @@ class ServeConfig:
         self.filter_config()
         if not 0 <= self.port <= 65535:
             raise ServeError(f"--port must be 0 to 65535, got {self.port}")
+        if self.workers < 1:
+            raise ServeError(f"--workers must be at least 1, got {self.workers}")
+        if self.workers > 1 and self.max_age_ms is not None:
+            raise ServeError("--max-age-ms: one process must follow a robot's clock, not with --workers")
+        if self.workers > 1 and self.bundles is not None:
+            raise ServeError("--bundles: POST /model would change one process alone: not with --workers")
         if self.max_body < 1 or self.max_connections < 1:
             raise ServeError("--max-body and --max-connections must be at least 1")
         for flag, seconds in (("--read-seconds", self.read_seconds), ("--idle-seconds", self.idle_seconds)):
@@ -219,8 +229,8 @@ class ServeConfig:
     def _check_recording(self) -> None:
         sizes = (
             ("--record-file-mb", self.record_file_mb, LEAST_FILE),
-            ("--record-mb", self.record_mb, 2.0 * self.record_file_mb),
-            ("--incidents-mb", self.incidents_mb, 4.0 * LEAST_FILE),
+            ("--record-mb", self.record_mb, 2.0 * self.record_file_mb * self.workers),
+            ("--incidents-mb", self.incidents_mb, 4.0 * LEAST_FILE * self.workers),
         )
         for flag, size, least in sizes:
             if not (math.isfinite(size) and size >= least):
@@ -255,6 +265,7 @@ class DrainingServer(uvicorn.Server):
         freshness: which robots it knows.
         operation: looked at ten times a second.
         changer: loads the bundle anew on SIGHUP.
+        crew: the workers that it is one of.
     """
 
     def __init__(
@@ -267,9 +278,11 @@ class DrainingServer(uvicorn.Server):
         freshness: Freshness | None = None,
         operation: Operation | None = None,
         changer: Changer | None = None,
+        crew: Crew | None = None,
     ) -> None:
         super().__init__(config)
         self._operation = operation
+        self._crew = crew
         self._changer = changer
         self._change: asyncio.Task[None] | None = None
         self.server_state = self._door = door
@@ -281,6 +294,8 @@ class DrainingServer(uvicorn.Server):
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Starts to listen, and says so."""
+        if self._crew is not None:
+            await self._crew.start()
         await super().startup([])
         # uvicorn would wait a minute for a TLS handshake, in which the door sees no connection yet.
         patience = self._door.patience.read if self.config.ssl else None
@@ -442,8 +457,26 @@ def allow_files(connections: int) -> None:
         resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
 
 
-def serve(config: ServeConfig) -> None:
+class Place(NamedTuple):
+    """A worker's place among the others.
+
+    Attributes:
+        crew: the workers that it is one of.
+        listener: the socket that all of them accept from.
+        memory_key: the key that all of them seal memories with.
+    """
+
+    crew: Crew
+    listener: socket.socket
+    memory_key: bytes
+
+
+def serve(config: ServeConfig, place: Place | None = None) -> None:
     """Serves until told to stop.
+
+    Args:
+        config: the settings.
+        place: that of one worker; None: the service is not one of several.
 
     Raises:
         ServeError: for settings or an address that cannot be had.
@@ -454,10 +487,17 @@ def serve(config: ServeConfig) -> None:
     """
     config.check()
     keys = read_keys(config)
-    memory_key = read_memory_key(config.memory_key_file)
+    memory_key = place.memory_key if place is not None else read_memory_key(config.memory_key_file)
     rules = read_rules(config.alarms)
     allow_files(config.max_connections)
-    listener = listen(config.host, config.port, keys)
+    if config.workers > 1:
+        from server.workers import supervise
+
+        if holds := [name for name, rule in rules.items() if rule.effect == "hold"]:
+            raise ServeError(f"--alarms: {holds[0]} would hold one process alone: not with --workers")
+        supervise(config, listen(config.host, config.port, keys), memory_key)
+        return
+    listener = place.listener if place is not None else listen(config.host, config.port, keys)
     with listener:
 
         def load(bundle: Path) -> Monitor:
@@ -473,6 +513,8 @@ def serve(config: ServeConfig) -> None:
         announcement = json.dumps(ready | gate)
         with Events(config.log) as events, recorder_of(config, monitor) as recorder:
             safety = config.safety()
+            if place is not None:
+                safety = replace(safety, freshness=replace(safety.freshness, alone=False))
             freshness = Freshness(safety.freshness, monitor.faults.note)
             operation = Operation(monitor, recorder, rules, events)
             changer = Changer(operation, load, config.bundle, config.bundles)
@@ -488,13 +530,14 @@ def serve(config: ServeConfig) -> None:
                 freshness=freshness,
                 memory_key=memory_key,
                 filter_config=config.filter_config(),
+                around=None if place is None else place.crew.around,
             )
             # What is loaded stays: looking through it again and again for garbage would hold up decisions.
             gc.collect()
             gc.freeze()
-            _server(app, lifecycle, config, announcement, freshness, operation, changer).run(
-                sockets=[listener]
-            )
+            crew = None if place is None else place.crew
+            server = _server(app, lifecycle, config, announcement, freshness, operation, changer, crew)
+            server.run(sockets=[listener])
             operation.stop()
 
 
@@ -518,6 +561,7 @@ def _server(
     freshness: Freshness,
     operation: Operation,
     changer: Changer,
+    crew: Crew | None,
 ) -> DrainingServer:
     settings = uvicorn.Config(
         app,
@@ -539,7 +583,7 @@ def _server(
     patience = Patience(config.read_seconds, config.idle_seconds, config.max_connections)
     door = Door(patience, app.is_robots)
     return DrainingServer(
-        settings, lifecycle, config.drain_seconds, announcement, door, freshness, operation, changer
+        settings, lifecycle, config.drain_seconds, announcement, door, freshness, operation, changer, crew
     )
 
 
