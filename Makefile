@@ -46,7 +46,7 @@ benchmark: setup ## every measurement, one after the other
 	$(BIN)/python -m benchmarks.server $(BUNDLE)
 	$(BIN)/python -m benchmarks.recording $(BUNDLE)
 	$(BIN)/python -m benchmarks.live $(BUNDLE)
-	$(BIN)/python -m benchmarks.fleet $(BUNDLE) --ray
+	$(BIN)/python -m benchmarks.fleet $(BUNDLE)
 
 clean: ## remove what make made
 	rm -rf $(VENV) demo build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
