@@ -49,6 +49,7 @@ def clearance(
     first: int,
     exact: bool,
     charged: bool,
+    beaten: float,
 ) -> tuple[float, int, int]:
     """The best clearance that a backup reaches over the number of steps for which it thrusts.
 
@@ -62,13 +63,14 @@ def clearance(
         first: the obstacle to look at first; -1 for any.
         exact: whether the clearance matters below ``enough``, too; else it is only known to be below.
         charged: whether to take off what any one action might cost first, see `loss`.
+        beaten: what another backup reaches [m]: no more than that does not matter.
 
     Returns:
         The clearance [m], after ``travel_error``; the obstacle that bounds it, -1 if none; the steps of
-        thrust.
+        thrust. ``beaten`` where it is no more.
     """
     at = start
-    best = -FAR
+    best = beaten
     blocker = first
     steps = 0
     path = FAR
@@ -148,7 +150,7 @@ def best_backup(
     Returns:
         The clearance [m], the obstacle that bounds it, which backup, and for how many steps it thrusts.
     """
-    best = -2.0 * FAR
+    best = -FAR
     blocker = -1
     # No manoeuvre is farther from an obstacle than the robot is now.
     here, nearest = least_gap(obstacles, count, start.x, start.y, start.x, start.y, -1, -FAR)
@@ -164,7 +166,7 @@ def best_backup(
         kind = turn if ahead < 0.0 or turn == TURN else 1 - turn
         first = blocker if blocker >= 0 else nearest
         value, at, count_steps = clearance(
-            settings, kind, obstacles, count, start, enough, first, exact, charged
+            settings, kind, obstacles, count, start, enough, first, exact, charged, best
         )
         if value > best:
             best, blocker, chosen, steps = value, at, kind, count_steps

@@ -164,7 +164,7 @@ def test_the_clearance_is_the_best_over_the_steps_of_thrust(numbers):
         for steps in range(PLAN_STEPS + 1):
             clearances(numbers, kind, steps, obstacles, 3, start, out)
             every.append((out.min(), int(out.argmin())))
-        value, nearest, steps = clearance(numbers, kind, obstacles, 3, start, FAR, -1, True, False)
+        value, nearest, steps = clearance(numbers, kind, obstacles, 3, start, FAR, -1, True, False, -FAR)
         assert value == pytest.approx(max(every)[0], abs=1e-9)
         assert every[steps] == (pytest.approx(value, abs=1e-9), nearest)
 
@@ -173,7 +173,7 @@ def test_the_best_backup_is_the_best_and_the_sure_one_pays_for_any_action(number
     for state, obstacles in random_cases(150, seed=2):
         start = stopping(numbers["robot"], state)
         every = [
-            clearance(numbers, kind, obstacles, 3, start, FAR, -1, True, False) for kind in range(BACKUPS)
+            clearance(numbers, kind, obstacles, 3, start, FAR, -1, True, False, -FAR) for kind in range(BACKUPS)
         ]
         here = np.linalg.norm(obstacles[:, :2], axis=1).min() - 0.21
         value, _, kind, steps = best_backup(numbers, obstacles, 3, start, FAR, False)
