@@ -173,7 +173,8 @@ def test_the_best_backup_is_the_best_and_the_sure_one_pays_for_any_action(number
     for state, obstacles in random_cases(150, seed=2):
         start = stopping(numbers["robot"], state)
         every = [
-            clearance(numbers, kind, obstacles, 3, start, FAR, -1, True, False, -FAR) for kind in range(BACKUPS)
+            clearance(numbers, kind, obstacles, 3, start, FAR, -1, True, False, -FAR)
+            for kind in range(BACKUPS)
         ]
         here = np.linalg.norm(obstacles[:, :2], axis=1).min() - 0.21
         value, _, kind, steps = best_backup(numbers, obstacles, 3, start, FAR, False)
