@@ -45,6 +45,7 @@ benchmark: setup ## every measurement, one after the other
 	$(BIN)/python -m benchmarks.filter
 	$(BIN)/python -m benchmarks.server $(BUNDLE)
 	$(BIN)/python -m benchmarks.recording $(BUNDLE)
+	$(BIN)/python -m benchmarks.soak $(BUNDLE)
 	$(BIN)/python -m benchmarks.live $(BUNDLE)
 	$(BIN)/python -m benchmarks.fleet $(BUNDLE)
 

@@ -51,6 +51,8 @@ class Use(IntEnum):
     """`lagnet-calibrate --novelty`: what a policy's own drives look like."""
     SENSORS = 15
     """`benchmarks.sensors`; the rest: which sensor fails when, and how."""
+    SOAK = 16
+    """`benchmarks.soak`."""
 
 
 def rows(use: Use, seed: int, count: int) -> list[int]:
