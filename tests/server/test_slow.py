@@ -20,7 +20,7 @@ from models import Bundle, write_bundle
 from monitor import Monitor
 from server.app import create_app
 
-SIDE = 1900
+SIDE = 2800
 """Side of the square matrices that the slow policy multiplies."""
 
 
@@ -63,7 +63,7 @@ def ask(link: http.client.HTTPConnection, method: str, path: str, body: bytes | 
 
 @pytest.fixture(scope="module")
 def port(slow_bundle: Path) -> Iterator[int]:
-    """The port of a service whose policy takes 100 ms."""
+    """The port of a service whose policy takes some 200 ms."""
     with Service.start(slow_bundle, "risk") as service:
         yield int(service.url.rsplit(":", 1)[1])
 
