@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import http.client
 import json
 import shutil
@@ -16,6 +17,7 @@ from pathlib import Path
 import pytest
 
 from evaluation.service import Service
+from server import AsyncClient, Client, ClientError
 from server.serve import ServeConfig, ServeError, serve
 
 READ = 0.5
@@ -101,3 +103,31 @@ def test_files_that_are_no_certificate_and_its_key(files, cert, key, why) -> Non
     given = {name: folder / file for name, file in (("tls_cert", cert), ("tls_key", key)) if file}
     with pytest.raises(ServeError, match=why):
         serve(ServeConfig(Path("/none"), **given))
+
+
+@pytest.mark.parametrize("scheme", ["https", "wss"])
+def test_a_client_verifies_and_is_decided_about(
+    service: Service, files, monitor, observation, scheme
+) -> None:
+    url = service.url.replace("https", scheme)
+    expected, memory = monitor.decide(observation), None
+    with Client(url, timeout=5.0, ca_file=files[0], robot="ada") as client:
+        for _ in range(20):
+            decision = client.decide(observation, memory=memory)
+            assert decision.reason is None
+            memory = decision.memory
+        assert not client.faults.counts
+    # Whoever signed it is not known to the system.
+    with pytest.raises(ClientError, match="certificate verify failed"):
+        Client(url, timeout=5.0)
+
+
+def test_an_async_client_verifies_as_well(service: Service, files, observation) -> None:
+    async def run() -> None:
+        async with AsyncClient(service.url, timeout=5.0, ca_file=files[0]) as client:
+            assert (await client.decide(observation)).reason is None
+        with pytest.raises(ClientError, match="certificate verify failed"):
+            async with AsyncClient(service.url, timeout=5.0):
+                pass
+
+    asyncio.run(run())
