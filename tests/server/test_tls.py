@@ -106,11 +106,8 @@ def test_files_that_are_no_certificate_and_its_key(files, cert, key, why) -> Non
 
 
 @pytest.mark.parametrize("scheme", ["https", "wss"])
-def test_a_client_verifies_and_is_decided_about(
-    service: Service, files, monitor, observation, scheme
-) -> None:
-    url = service.url.replace("https", scheme)
-    expected, memory = monitor.decide(observation), None
+def test_a_client_verifies_and_is_decided_about(service: Service, files, observation, scheme) -> None:
+    url, memory = service.url.replace("https", scheme), None
     with Client(url, timeout=5.0, ca_file=files[0], robot="ada") as client:
         for _ in range(20):
             decision = client.decide(observation, memory=memory)
