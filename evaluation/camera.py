@@ -11,10 +11,13 @@ from pathlib import Path
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 """Commands that start a browser which Playwright can drive."""
 NONE_HERE = "no browser takes a picture of the live page: apt-get install chromium"
+TOO_SHORT = "no picture of the live page: no robot was live for long enough"
 WIDTH, HEIGHT = 1440, 900
 """Of the picture [pixels]."""
 _EVERY = 2.0
 """Seconds between two pictures, of which the last one is kept."""
+_SOON = 0.1
+"""Seconds between two looks until there is the first: a drive may be short."""
 _IS_LIVE = 'document.querySelector("[data-live=true] #looked[data-stale=false]") !== null'
 
 
@@ -62,14 +65,14 @@ def _watch(path: str, url: str, picture: Path, done: threading.Event) -> str:
             opened = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
             page = opened.new_page(viewport={"width": WIDTH, "height": HEIGHT})
             page.goto(url)
-            while not done.wait(_EVERY):
+            while not done.wait(_EVERY if taken else _SOON):
                 if page.evaluate(_IS_LIVE):
                     taken = page.screenshot()
             opened.close()
     except Error as error:
         return f"no picture of the live page: {error.message.splitlines()[0]}"
     if taken is None:
-        return "no picture of the live page: no robot was live for long enough"
+        return TOO_SHORT
     try:
         picture.write_bytes(taken)
     except OSError as error:
