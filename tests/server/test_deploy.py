@@ -115,7 +115,7 @@ def test_an_image_is_made_of_the_runtime_and_nothing_else() -> None:
 @needs("systemd-analyze")
 def test_systemd_takes_the_unit(tmp_path: Path) -> None:
     unit = tmp_path / "lagnet.service"
-    unit.write_text(UNIT.replace("/opt/lagnet/bin/lagnet-serve", sys.executable))
+    unit.write_text(UNIT.replace("/usr/local/lib/lagnet/bin/lagnet-serve", sys.executable))
     result = subprocess.run(["systemd-analyze", "verify", unit], capture_output=True, text=True, check=False)
     assert (result.returncode, result.stderr) == (0, "")
 
