@@ -13,9 +13,8 @@ import secrets
 import socket
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
-from tempfile import NamedTemporaryFile
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -26,8 +25,7 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.recording import RecordingBenchmark, bodies, slower, times
-from benchmarks.server import Connection, cases, full_memory
-from evaluation.service import Service
+from benchmarks.server import Connection, cases, full_memory, with_key
 from filter import FilterConfig
 from monitor import Monitor
 from server.keeper import KEY_BYTES
@@ -72,13 +70,7 @@ def run(config: LiveBenchmark) -> dict[str, dict[str, FloatArray]]:
     monitor = Monitor.load(config.bundle, config.gate)
     level, key = monitor.bundle.manifest.level, secrets.token_bytes(KEY_BYTES)
     measured = {}
-    with ExitStack() as stack:
-        file = stack.enter_context(NamedTemporaryFile())
-        file.write(key)
-        file.flush()
-        service = stack.enter_context(
-            Service.start(config.bundle, config.gate, None, "--memory-key-file", file.name)
-        )
+    with with_key(config.bundle, config.gate, key) as service:
         for name, case in cases(level, full_memory(monitor, key)).items():
             connection = Connection(f"{service.url}/act", *bodies(level, case.asked))
             connection.times(500)

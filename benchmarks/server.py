@@ -15,7 +15,8 @@ import socket
 import sys
 import threading
 import time
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from itertools import cycle
 from pathlib import Path
@@ -240,6 +241,16 @@ def over_http(url: str, case: Case, config: ServerBenchmark) -> list[float]:
     return [float(p50), float(p99), *rates]
 
 
+@contextmanager
+def with_key(bundle: Path, gate: GateName, key: bytes) -> Iterator[Service]:
+    """A service that seals memories with a key, so that others can make them, see `full_memory`."""
+    with NamedTemporaryFile() as file:
+        file.write(key)
+        file.flush()
+        with Service.start(bundle, gate, None, "--memory-key-file", file.name) as service:
+            yield service
+
+
 def run(config: ServerBenchmark) -> dict[str, list[float]]:
     """Starts both services, measures them in turn, stops them; the medians over rounds."""
     monitor = Monitor.load(config.bundle, config.gate)
@@ -247,12 +258,7 @@ def run(config: ServerBenchmark) -> dict[str, list[float]]:
     measured = cases(monitor.bundle.manifest.level, full_memory(monitor, key))
     seen: dict[str, list[list[float]]] = {}
     with ExitStack() as stack:
-        file = stack.enter_context(NamedTemporaryFile())
-        file.write(key)
-        file.flush()
-        service = stack.enter_context(
-            Service.start(config.bundle, config.gate, None, "--memory-key-file", file.name)
-        )
+        service = stack.enter_context(with_key(config.bundle, config.gate, key))
         echo = stack.enter_context(Service.run([sys.executable, "-m", "benchmarks.server", "--echo"]))
         for _ in range(config.rounds):
             for name, case in measured.items():
