@@ -4,7 +4,7 @@ from filter.barrier_filter import BarrierFilter
 from filter.config import FilterConfig
 from filter.errors import FilterError, FilterInputError, SolverError
 from filter.scene import DOUBT, Scene
-from filter.step import Step
+from filter.step import Led, Step
 from filter.wrapper import SafetyFilter
 from system.point_robot import Robot
 
@@ -14,6 +14,7 @@ __all__ = [
     "FilterConfig",
     "FilterError",
     "FilterInputError",
+    "Led",
     "Robot",
     "SafetyFilter",
     "Scene",

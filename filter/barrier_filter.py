@@ -13,19 +13,13 @@ from filter.config import FilterConfig, settings
 from filter.programme import Programme
 from filter.qp import Problem
 from filter.scene import Scene
-from filter.solvers import make_solver
-from filter.step import Step
+from filter.solvers import make_solver, planar
+from filter.step import Led, Step
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
-LINEARISATIONS = (0.0, 0.0, 2.0, 0.0, 0.5, 0.1, 0.02)
-"""How the QP is linearised, one after the other, until its solution is certified. 0: about the reference
-first, about the last solution afterwards. Above 0: about the best backup's own action, which is feasible, and
-the solution stays so near to it (2 leaves the whole box): a step is not smooth in the turn, whose servo
-chatters, so that a linearisation may hold nearby only."""
-_NOBODY = np.empty(0, np.int64)
 _CHUNK = 512
 """Robots handled at once: bounds the memory of the obstacles."""
 
@@ -33,8 +27,8 @@ _CHUNK = 512
 class Guide(Protocol):
     """Leads robots round what is in their way; `guide.Guide` is one."""
 
-    def propose(self, step: Step) -> tuple[IntArray, FloatArray]:
-        """The rows (n,) of the robots that are led, and the references (n, 2) in place of their actions."""
+    def propose(self, step: Step) -> Led | None:
+        """Who is led, and by which references in place of their actions; None: nobody."""
 
 
 class BarrierFilter:
@@ -114,23 +108,13 @@ class BarrierFilter:
         """
         doubtful = np.count_nonzero(view.doubted) > 0
         step = Step(self._settings, view, nominal, memory, active & ~view.doubted if doubtful else active)
-        refused = step.active & ~step.certified
-        led: IntArray = _NOBODY
-        if self.guide is not None:
-            led, proposed = self.guide.propose(step)
-            if led.size:
-                step.send(led, proposed, Mode.GUIDED, Origin.GUIDE)
-                refused[led] = ~step.certify(led, proposed, np.full(len(led), self.config.hysteresis))
-        left = refused.nonzero()[0]
-        if left.size:
-            free = np.ones(len(nominal), np.bool_)
-            free[led] = False
-            step.blame(left, view.source[left, step.nearest(left)])
-            # Where the best backup keeps less than any certificate needs, there is none to be found.
-            hopeless = view.barrier[left] < step.need[left]
-            hoped = left[~hopeless]
-            hoped = self._by_search(step, self._by_qp(step, Programme(step, hoped, free[hoped])))
-            self._fall_back(step, np.concatenate([left[hopeless], hoped]))
+        led = None if self.guide is None else self.guide.propose(step)
+        if step.refused or led is not None:
+            hoped, hopeless = step.settle(led, self._solver is planar)
+            if hoped.size and self._solver is not planar:
+                hoped = self._by_qp(step, hoped, led)
+            if hoped.size or hopeless.size:
+                self._fall_back(step, np.concatenate([hopeless, self._by_search(step, hoped)]))
         if doubtful:
             step.distrust((active & view.doubted).nonzero()[0])
         return step.decisions()
@@ -143,29 +127,23 @@ class BarrierFilter:
         view = self.look(np.asarray(observation)[None], given)
         nominal = scene.check_action(np.asarray(nominal_action)[None], 1)
         step = Step(self._settings, view, nominal, scene.check_memory(None, 1), np.ones(1, np.bool_))
-        return Programme(step, np.zeros(1, np.int64), step.active).problem() if step.refused else None
+        return Programme(step, 0, circulating=True).problem(trust=0.0) if step.refused else None
 
-    def _by_qp(self, step: Step, programme: Programme) -> IntArray:
-        """Send the QP's own solution where it is certified; the rows that are left."""
-        for trust in LINEARISATIONS:
-            if not programme.rows.size:
-                break
-            programme.linearise(trust)
-            programme.solve(self._solver)
-            rows, action = programme.rows, programme.action()
-            done = programme.solved & step.certify(rows, action, step.need[rows])
-            step.send(rows[done], action[done], Mode.FILTERED, Origin.BARRIER)
-            circled = done & programme.circulates
-            step.send(rows[circled], action[circled], Mode.FILTERED, Origin.CIRCULATION)
-            programme.keep(~done)
-        return programme.rows
+    def _by_qp(self, step: Step, rows: IntArray, led: Led | None) -> IntArray:
+        """Send what another solver than ours makes of the QPs, where certified; the rows that are left."""
+        for k in rows:
+            outcome, action = Programme(step, k, led is None or not led.which[k]).run(self._solver)
+            if outcome != kernel.OPEN:
+                origin = Origin.CIRCULATION if outcome == kernel.CIRCULATION else Origin.BARRIER
+                step.send(np.array([k]), action, Mode.FILTERED, origin)
+                rows = rows[rows != k]
+        return rows
 
     def _by_search(self, step: Step, rows: IntArray) -> IntArray:
         """Send the certified action nearest to the reference, of those that are tried; the rows left."""
         if not rows.size:
             return rows
-        found = step.search(rows)
-        done: BoolArray = step.certificates["clearance"][rows] >= step.need[rows]
+        found, done = step.search(rows)
         step.send(rows[done], found[done], Mode.FILTERED, Origin.SEARCH)
         return rows[~done]
 

@@ -13,14 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from decision import MOST_LATE
-from filter.certificate import CERTIFICATE
-from filter.certificate import certify as certify_one
 from filter.circulation import SIDE_STEPS, circulate
 from filter.config import Settings
 from filter.qp import after, barrier_rows
 from filter.recovery import commit, drive_out
+from filter.solvers import solve_planar
 from pointgoal.observation import LIDAR_RANGE
 from system.backups import law, write_plan
+from system.certificate import CERTIFICATE
+from system.certificate import certify as certify_one
 from system.clearance import best_backup, clearances
 from system.compiled import compiled, entry
 from system.lidar import contradictory
@@ -50,6 +51,14 @@ SEEN = np.dtype(
 """One robot when its next action takes effect, as the filter sees it: where that is, from where it was seen
 [m, rad]; its velocity ahead and to the left [m/s], its yaw rate [rad/s]; how many obstacles are within reach;
 its best backup from there, whose clearance is the barrier; one that keeps 0 after any one action, if any."""
+PASSED, LED, BARRIER, CIRCULATION, HOPELESS, OPEN = 0, 1, 2, 3, 4, 5
+"""What `settle` comes to: the action passes as it is; the guide's is certified; the QP's is, by its barrier
+rows alone, or with the circulation row; none can be; none is so far."""
+LINEARISATIONS = (0.0, 0.0, 2.0, 0.0, 0.5, 0.1, 0.02)
+"""How the QP is linearised, one after the other, until its solution is certified. 0: about the reference
+first, about the last solution afterwards. Above 0: about the best backup's own action, which is feasible, and
+the solution stays so near to it (2 leaves the whole box): a step is not smooth in the turn, whose servo
+chatters, so that a linearisation may hold nearby only."""
 COMMITTED, UNKEPT, INSIDE = 0, 1, 2
 """What `recover` finds: a backup that keeps the inner margin; one that does not; a robot inside a hazard."""
 _GRID = 5
@@ -162,100 +171,169 @@ def screen(
 
 
 @entry
+def needed(settings: Records, seen: Records, k: int) -> float:
+    """Clearance [m] that certifies what the filter puts in place of robot k's action, which was refused.
+
+    It is 0, or what there is, if that is a little less: a robot that has lost a millimetre of its margin may
+    keep what it has. A robot that is off needs the margin for what it may lose in a step.
+    """
+    config, robot = settings[0], settings[0].robot
+    way = robot.gear * robot.force_limit / robot.drag * robot.physics_step * robot.substeps
+    inner = max(0.5 * (config.margin - config.sure) - config.travel_error * way, 0.0)
+    return float(min(max(seen[k].now.clearance, -inner), 0.0))
+
+
+@entry
 def certify(
     settings: Records,
     seen: Records,
     obstacles: FloatArray,
-    rows: IntArray,
+    k: int,
     action: FloatArray,
-    least: FloatArray,
+    least: float,
     certificates: Records,
-) -> None:
-    """Look for certificates that keep a clearance ``least`` (n,) [m].
+) -> bool:
+    """Whether an ``action`` (2,) of robot k has a certificate that keeps a clearance ``least`` [m].
 
     A clearance at or above ``least`` says no more than that, one below only that it is below.
     """
-    config = settings[0]
-    for j in range(len(rows)):
-        k = rows[j]
-        u1, u2 = action[j]
-        found = certify_one(config, obstacles[k], seen[k].count, _state(seen[k]), u1, u2, least[j])
-        one = certificates[k]
-        one.clearance, one.nearest, one.backup, one.steps = found
+    near, state, one = obstacles[k], _state(seen[k]), certificates[k]
+    found = certify_one(settings[0], near, seen[k].count, state, action[0], action[1], least)
+    one.clearance, one.nearest, one.backup, one.steps = found
+    return bool(found[0] >= least)
 
 
 @entry
-def linearise(
+def write_problem(
     settings: Records,
     seen: Records,
     obstacles: FloatArray,
-    rows: IntArray,
-    about: FloatArray,
+    k: int,
+    nearest: int,
     trust: float,
+    reference: FloatArray,
+    asked: bool,
+    memory: Records,
+    about: FloatArray,
     G: FloatArray,
     h: FloatArray,
-    count: IntArray,
-) -> None:
-    """Write the barrier rows of QPs to ``G`` (n, m, 2) and ``h`` (n, m), and how many to ``count`` (n,).
+) -> int:
+    """Write the barrier rows of robot k's QP to ``G`` (m, 2) and ``h`` (m,); how many there are.
 
-    They are linearised about ``about`` (n, 2), in the QP's variables, for the best backup after that. With a
+    They are linearised about ``about`` (2,), in the QP's variables, for the best backup after that. With a
     ``trust`` above 0, it is the best backup from here that counts: its own action is written to ``about``,
     the rows are those of what is left of it, and four more keep the solution as near to that action.
+
+    If the circulation row is ``asked`` for, it stands behind them: ``nearest`` is the obstacle that refuses
+    the ``reference`` (2,) of the QP, and the side in ``memory`` (N,) becomes the new one.
     """
-    config = settings[0]
-    now, work = np.empty(h.shape[1]), np.empty((3, h.shape[1]))
-    for j in range(len(rows)):
-        k = rows[j]
-        one, near, state = seen[k], obstacles[k], _state(seen[k])
-        at = stopping(config.robot, state)
-        clearances(config, one.now.backup, one.now.steps, near, one.count, at, now)
-        if trust > 0.0:
-            about[j] = law(config.robot, one.now.backup, at) if one.now.steps > 0 else (0.0, 0.0)
-            backup = (one.now.backup, max(one.now.steps - 1, 0))
-            end = after(config, state, about[j, 0], about[j, 1])
-            clearances(config, backup[0], backup[1], near, one.count, end, work[0])
-            for i in range(one.count):
-                now[i] = min(now[i], work[0, i])
-        else:
-            end = after(config, state, about[j, 0], about[j, 1])
-            found = best_backup(config, near, one.count, end, FAR, False)
-            backup = (found[2], found[3])
-        count[j] = barrier_rows(config, near, one.count, state, now, about[j], backup, G[j], h[j], work)
-        if 0.0 < trust < 2.0:
-            for i in range(4):
-                sign = 1.0 - 2.0 * (i % 2)
-                G[j, count[j]] = (sign, 0.0) if i < 2 else (0.0, sign)
-                h[j, count[j]] = sign * about[j, i // 2] + trust
-                count[j] += 1
+    config, one, near, state = settings[0], seen[k], obstacles[k], _state(seen[k])
+    now, work, at = np.empty(len(h)), np.empty((3, len(h))), stopping(config.robot, state)
+    clearances(config, one.now.backup, one.now.steps, near, one.count, at, now)
+    if trust > 0.0:
+        about[0], about[1] = law(config.robot, one.now.backup, at) if one.now.steps > 0 else (0.0, 0.0)
+        backup = (one.now.backup, max(one.now.steps - 1, 0))
+        end = after(config, state, about[0], about[1])
+        clearances(config, backup[0], backup[1], near, one.count, end, work[0])
+        for i in range(one.count):
+            now[i] = min(now[i], work[0, i])
+    else:
+        end = after(config, state, about[0], about[1])
+        found = best_backup(config, near, one.count, end, FAR, False)
+        backup = (found[2], found[3])
+    rows = barrier_rows(config, near, one.count, state, now, about, backup, G, h, work)
+    if 0.0 < trust < 2.0:
+        for i in range(4):
+            sign = 1.0 - 2.0 * (i % 2)
+            G[rows, 0], G[rows, 1] = (sign, 0.0) if i < 2 else (0.0, sign)
+            h[rows] = sign * about[i // 2] + trust
+            rows += 1
+    if asked:
+        side = (memory[k].side > 0) - (memory[k].side < 0)
+        side, turn = circulate(config, near[nearest], state, reference, side)
+        memory[k].side = side * SIDE_STEPS
+        G[rows, 0], G[rows, 1], h[rows] = 0.0, -1.0 if turn >= 0.0 else 1.0, -abs(turn)
+    return rows
 
 
-@entry
-def add_circulation(
+@compiled
+def _by_qp(
     settings: Records,
     seen: Records,
     obstacles: FloatArray,
-    rows: IntArray,
-    nearest: IntArray,
-    reference: FloatArray,
-    asked: BoolArray,
+    k: int,
+    circulating: bool,
     memory: Records,
-    G: FloatArray,
-    h: FloatArray,
-    count: IntArray,
-) -> None:
-    """Write the circulation row behind the rows of QPs; ``count`` stays.
+    action: FloatArray,
+    certificates: Records,
+) -> int:
+    """`BARRIER` or `CIRCULATION`, and the ``action`` (2,), if the QP's solution is certified; or `OPEN`."""
+    config, most = settings[0], obstacles.shape[1] + 5
+    limit, least = config.robot.force_limit, needed(settings, seen, k)
+    nearest, weights = max(certificates[k].nearest, 0), np.array((config.thrust_weight, 1.0))
+    x, about, found, G, h = np.empty(2), np.empty(2), np.empty(2), np.empty((most, 2)), np.empty(most)
+    x[0], x[1] = min(max(action[0] / limit, -1.0), 1.0), min(max(action[1], -1.0), 1.0)
+    reference = x.copy()
+    for trust in LINEARISATIONS:
+        about[:] = x
+        asked = nearest, trust, reference, circulating, memory
+        rows = write_problem(settings, seen, obstacles, k, *asked, about, G, h)
+        circled = circulating and solve_planar(weights, reference, G, h, rows + 1, x)
+        if not (circled or solve_planar(weights, reference, G, h, rows, x)):
+            continue
+        found[0], found[1] = x[0] * limit, x[1]
+        if certify(settings, seen, obstacles, k, found, least, certificates):
+            action[:] = found
+            return CIRCULATION if circled else BARRIER
+    return OPEN
 
-    ``nearest`` (n,) is the obstacle that refuses the ``reference`` (n, 2) of the QP. The side that is
-    remembered in ``memory`` (N,) becomes the new one where the row is ``asked`` for (n,).
+
+@entry
+def settle(
+    settings: Records,
+    seen: Records,
+    obstacles: FloatArray,
+    source: IntArray,
+    active: BoolArray,
+    certified: BoolArray,
+    led: BoolArray,
+    own: bool,
+    action: FloatArray,
+    hazard: IntArray,
+    certificates: Records,
+    memory: Records,
+    outcome: NDArray[np.int8],
+) -> int:
+    """Decide about the robots that are ``led`` (N,) and those whose action has no certificate; how many stay.
+
+    ``source`` (N, M) is each obstacle's hazard, or n + its bin; ``active`` (N,) whose action may be changed;
+    ``certified`` (N,) whose nominal one has a certificate; ``led`` (N,) whose ``action`` (N, 2) is the
+    guide's, and the others' are the nominal ones. It becomes what is sent, ``certificates`` those of it, and
+    ``memory`` (N,) receives the plans that they end in; ``hazard`` (N,) receives what refuses an action, and
+    ``outcome`` (N,) what this comes to: `PASSED`, `LED`, `BARRIER`, `CIRCULATION`, `HOPELESS` or `OPEN`.
+    Without our ``own`` solver nothing is done about those that are `OPEN`.
     """
-    for j in range(len(rows)):
-        k = rows[j]
-        side = (memory[k].side > 0) - (memory[k].side < 0)
-        way = circulate(settings[0], obstacles[k, nearest[j]], _state(seen[k]), reference[j], side)
-        if asked[j]:
-            memory[k].side = way[0] * SIDE_STEPS
-        G[j, count[j]] = (0.0, -1.0 if way[1] >= 0.0 else 1.0)
-        h[j, count[j]] = -abs(way[1])
+    left = 0
+    for k in range(len(seen)):
+        outcome[k] = PASSED
+        if not active[k] or (certified[k] and not led[k]):
+            continue
+        robot = settings, seen, obstacles, k
+        if led[k] and certify(*robot, action[k], settings[0].hysteresis, certificates):
+            outcome[k] = LED
+        else:
+            nearest = certificates[k].nearest
+            hazard[k] = source[k, nearest] if nearest >= 0 else -1
+            # Where the best backup keeps less than any certificate needs, there is none to be found.
+            outcome[k] = OPEN if seen[k].now.clearance >= needed(settings, seen, k) else HOPELESS
+            if own and outcome[k] == OPEN:
+                circulating = settings[0].circulation > 0.0 and not led[k]
+                outcome[k] = _by_qp(*robot, circulating, memory, action[k], certificates)
+        if outcome[k] == OPEN or outcome[k] == HOPELESS:
+            left += 1
+        else:
+            _keep_plan(settings[0], seen[k], action[k], certificates[k], memory[k])
+    return left
 
 
 @entry
@@ -264,15 +342,14 @@ def search(
     seen: Records,
     obstacles: FloatArray,
     rows: IntArray,
-    wanted: FloatArray,
-    need: FloatArray,
     action: FloatArray,
     certificates: Records,
+    done: BoolArray,
 ) -> None:
-    """Find on a grid the certified ``action`` nearest to ``wanted`` (n, 2) in the QP's norm.
+    """Find on a grid the certified ``action`` (n, 2) nearest to what it is, in the QP's norm.
 
     For a robot that stands, it is the one that leaves the most clearance: the nearest might be to stay.
-    ``need`` (N,) is the clearance that certifies each; where none does, the certificate's is below.
+    ``done`` (n,) receives whether there is one; where there is none, ``action`` stays.
     """
     config = settings[0]
     limit = config.robot.force_limit
@@ -281,20 +358,22 @@ def search(
         state, one = _state(seen[k]), certificates[k]
         now = stopping(config.robot, state)
         stands = math.hypot(now.zx, now.zy) <= _STANDS
-        enough = FAR if stands else need[k]
+        need = needed(settings, seen, k)
+        enough = FAR if stands else need
+        wanted = min(max(action[j, 0] / limit, -1.0), 1.0), min(max(action[j, 1], -1.0), 1.0)
         best = FAR
-        one.clearance = -FAR
+        done[j] = False
         for i in range(_GRID * _GRID):
             f = 1.0 - 2.0 * (i // _GRID) / (_GRID - 1)
             w = 1.0 - 2.0 * (i % _GRID) / (_GRID - 1)
-            cost = config.thrust_weight * (f - wanted[j, 0]) ** 2 + (w - wanted[j, 1]) ** 2
+            cost = config.thrust_weight * (f - wanted[0]) ** 2 + (w - wanted[1]) ** 2
             if cost >= best and not stands:
                 continue
             found = certify_one(config, obstacles[k], seen[k].count, state, f * limit, w, enough)
             if stands:
                 cost = -found[0]
-            if found[0] >= need[k] and cost < best:
-                best = cost
+            if found[0] >= need and cost < best:
+                best, done[j] = cost, True
                 one.clearance, one.nearest, one.backup, one.steps = found
                 action[j] = (f * limit, w)
 
@@ -334,6 +413,17 @@ def recover(
         found[j] = COMMITTED if kept else UNKEPT
 
 
+@compiled
+def _keep_plan(
+    config: Settings, seen: Settings, action: FloatArray, certificate: Settings, past: Settings
+) -> None:
+    """Write down that an action (2,) is sent, and the backup of its certificate from where it leads."""
+    past.planned, past.left = True, certificate.steps
+    past.history.sent[0, 0], past.history.sent[0, 1] = action[0], action[1]
+    plan = certificate.backup, certificate.steps, past.plan
+    write_plan(config.robot, _state(seen), action[0], action[1], *plan)
+
+
 @entry
 def keep_plans(
     settings: Records,
@@ -343,12 +433,9 @@ def keep_plans(
     certificates: Records,
     memory: Records,
 ) -> None:
-    """Write the backups of the certificates, from where ``action`` (N, 2) leads, to ``memory`` (N,)."""
+    """Write down what is sent, ``action`` (N, 2), to ``memory`` (N,), and the plans of some robots (N,)."""
     for k in range(len(which)):
-        if not which[k]:
-            continue
-        one, past = certificates[k], memory[k]
-        past.planned = True
-        past.left = one.steps
-        u1, u2 = action[k]
-        write_plan(settings[0].robot, _state(seen[k]), u1, u2, one.backup, one.steps, past.plan)
+        if which[k]:
+            _keep_plan(settings[0], seen[k], action[k], certificates[k], memory[k])
+        else:
+            memory[k].history.sent[0, 0], memory[k].history.sent[0, 1] = action[k]

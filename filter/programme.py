@@ -1,4 +1,4 @@
-"""The QPs of some robots, solved and linearised anew until their solutions are certified."""
+"""The QP of one robot, written down for any solver, and linearised anew until its solution is certified."""
 
 from __future__ import annotations
 
@@ -7,77 +7,53 @@ from numpy.typing import NDArray
 
 from filter import kernel
 from filter.qp import Problem
-from filter.solvers import Solver, solve_batch
+from filter.solvers import Solver, solve
 from filter.step import Step
 
 FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 
 
 class Programme:
-    """The QPs of those robots of a step whose reference is refused.
+    """The QP of a robot whose reference is refused; `kernel.settle` is the same in one go, by our solver.
 
     Args:
         step: the step.
-        rows: (n,) which robots.
-        circulating: (n,) whether the circulation row may be asked for: not of a robot that is led.
-
-    Attributes:
-        rows: (n,) those that are left.
-        reference: (n, 2) of the QPs, in their variables.
-        solved: (n,) whether there is a solution.
-        circulates: (n,) whether it keeps the circulation row.
+        k: which robot.
+        circulating: whether the circulation row is asked for: not of a robot that is led.
     """
 
-    def __init__(self, step: Step, rows: IntArray, circulating: BoolArray) -> None:
-        self.rows: IntArray = rows
-        self.reference = step.reference(rows)
-        self.solved = np.zeros(len(rows), np.bool_)
-        self.circulates = np.zeros(len(rows), np.bool_)
+    def __init__(self, step: Step, k: int, circulating: bool) -> None:
         self._step = step
+        self._k = k
+        self._circulating = circulating and bool(step.settings["circulation"][0] > 0.0)
+        self._largest = np.array([step.settings["robot"]["force_limit"][0], 1.0])
         self._weights = np.array([step.settings["thrust_weight"][0], 1.0])
-        self._nearest = step.nearest(rows)
-        self._x = self.reference
-        self._circulating = circulating & (step.settings["circulation"][0] > 0.0)
+        self._nearest = max(int(step.certificates["nearest"][k]), 0)
+        self._reference = np.clip(step.action[k] / self._largest, -1.0, 1.0)
+        self._x = self._reference
 
-    def linearise(self, trust: float) -> None:
-        """Build the QPs, about the last solutions or near the backups' actions; see `kernel.linearise`."""
-        step, n = self._step, len(self.rows)
-        scene = step.scene
-        most = int(scene.seen["count"][self.rows].max()) + 5
-        self._G, self._h = np.empty((n, most, 2)), np.empty((n, most))
-        self._count = np.empty(n, np.int64)
-        about = self._x.copy()
-        seen = (step.settings, scene.seen, scene.obstacles, self.rows)
-        kernel.linearise(*seen, about, trust, self._G, self._h, self._count)
-        asked = self._nearest, self.reference, self._circulating, step.memory
-        kernel.add_circulation(*seen, *asked, self._G, self._h, self._count)
+    def problem(self, trust: float) -> Problem:
+        """The QP, the circulation row last; ``trust`` as in `kernel.write_problem`."""
+        step, most = self._step, self._step.scene.obstacles.shape[1] + 5
+        G, h, about = np.empty((most, 2)), np.empty(most), self._x.copy()
+        seen = step.settings, step.scene.seen, step.scene.obstacles, self._k, self._nearest, trust
+        asked = self._circulating
+        rows = asked + kernel.write_problem(*seen, self._reference, asked, step.memory, about, G, h)
+        return Problem(self._weights, self._reference, G[:rows], h[:rows])
 
-    def solve(self, solver: Solver) -> None:
-        """Solve them: with the circulation row where there is a solution, else by the barrier rows alone."""
-        about = self._x
-        rows = self._count + self._circulating
-        self._x, self.solved = solve_batch(solver, self._weights, self.reference, self._G, self._h, rows)
-        self.circulates = self.solved & self._circulating
-        again = (~self.solved & self._circulating).nonzero()[0]
-        if again.size:
-            part = self.reference[again], self._G[again], self._h[again], self._count[again]
-            self._x[again], self.solved[again] = solve_batch(solver, self._weights, *part)
-        self._x = np.where(self.solved[:, None], self._x, about)
-
-    def action(self) -> FloatArray:
-        """The solutions as actions (n, 2) u1, u2."""
-        return self._x * (self._step.settings["robot"]["force_limit"][0], 1.0)
-
-    def keep(self, which: BoolArray) -> None:
-        """Go on with some of the robots."""
-        self.rows, self.reference = self.rows[which], self.reference[which]
-        self._x, self._nearest = self._x[which], self._nearest[which]
-        self._circulating = self._circulating[which]
-
-    def problem(self) -> Problem:
-        """The first robot's QP, linearised about its reference."""
-        self.linearise(trust=0.0)
-        rows = self._count[0] + self._circulating[0]
-        return Problem(self._weights, self.reference[0], self._G[0, :rows], self._h[0, :rows])
+    def run(self, solver: Solver) -> tuple[int, FloatArray]:
+        """What `kernel.settle` would say of it, and the action (2,) u1, u2."""
+        for trust in kernel.LINEARISATIONS:
+            problem = self.problem(trust)
+            found, circled = solve(solver, problem), self._circulating
+            if found is None and circled:
+                rows, circled = len(problem.h) - 1, False
+                found = solve(
+                    solver, Problem(self._weights, self._reference, problem.G[:rows], problem.h[:rows])
+                )
+            if found is None:
+                continue
+            self._x, action = found, found * self._largest
+            if self._step.certify(self._k, action):
+                return kernel.CIRCULATION if circled else kernel.BARRIER, action
+        return kernel.OPEN, self._step.action[self._k]

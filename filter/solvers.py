@@ -15,8 +15,6 @@ from filter.qp import Problem
 from system.compiled import compiled, entry
 
 FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 
 TOLERANCE = 1e-6
 """Largest residual of a solution that is accepted."""
@@ -120,27 +118,15 @@ def solve_planar(
 
 
 @entry
-def _solve_all(
-    weights: FloatArray,
-    reference: FloatArray,
-    G: FloatArray,
-    h: FloatArray,
-    rows: NDArray[np.int64],
-    x: FloatArray,
-    solved: NDArray[np.bool_],
-) -> None:
-    """Solve N problems: (N, 2), (N, M, 2), (N, M), (N,) -> (N, 2), (N,)."""
-    for k in range(rows.size):
-        solved[k] = solve_planar(weights, reference[k], G[k], h[k], rows[k], x[k])
+def _solve(weights: FloatArray, reference: FloatArray, G: FloatArray, h: FloatArray, x: FloatArray) -> bool:
+    """`solve_planar` with all of the rows."""
+    return bool(solve_planar(weights, reference, G, h, len(h), x))
 
 
 def planar(problem: Problem) -> FloatArray | None:
     """Solve one problem with `solve_planar`."""
-    x = np.empty((1, 2))
-    solved = np.zeros(1, dtype=bool)
-    rows = np.array([problem.h.size])
-    _solve_all(problem.weights, problem.reference[None], problem.G[None], problem.h[None], rows, x, solved)
-    return x[0] if solved[0] else None
+    x = np.empty(2)
+    return x if _solve(problem.weights, problem.reference, problem.G, problem.h, x) else None
 
 
 class KeptOSQP:
@@ -252,27 +238,15 @@ def make_solver(name: str) -> Solver:
     return ByQpsolvers(name)
 
 
-def solve_batch(
-    solver: Solver, weights: FloatArray, reference: FloatArray, G: FloatArray, h: FloatArray, rows: IntArray
-) -> tuple[FloatArray, BoolArray]:
-    """Solve N problems.
+def solve(solver: Solver, problem: Problem) -> FloatArray | None:
+    """A solution that keeps all rows; None if the solver has none, or breaks down.
 
-    ``reference`` (N, 2), ``G`` (N, M, 2) and ``h`` (N, M) are theirs; ``rows`` (N,) says how many rows count.
-
-    Returns:
-        The solutions (N, 2), the reference where there is none, and whether there is one (N,).
+    A solver's word is not enough: a solution that breaks a row counts as none.
     """
-    x, solved = reference.copy(), np.zeros(len(rows), np.bool_)
-    if solver is planar:
-        _solve_all(weights, reference, G, h, rows, x, solved)
-        return x, solved
-    for k, count in enumerate(rows):
-        problem = Problem(weights, reference[k], G[k, :count], h[k, :count])
-        try:
-            found = solver(problem)
-        except SolverError:
-            continue  # the next linearisation, or the search, does without
-        # A solver's word is not enough: a solution that breaks a row counts as none.
-        if found is not None and problem.residual(found) <= TOLERANCE:
-            x[k], solved[k] = np.clip(found, -1.0, 1.0), True
-    return x, solved
+    try:
+        found = solver(problem)
+    except SolverError:
+        return None  # the next linearisation, or the search, does without
+    if found is None or not problem.residual(found) <= TOLERANCE:
+        return None
+    return np.clip(found, -1.0, 1.0)

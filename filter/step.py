@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import math
-from functools import cached_property, lru_cache
+from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from decision import MEMORY, Decisions, Memory, Mode, OpenedBy, Origin, next_of_plan, texts, unknown
 from filter import kernel
-from filter.certificate import CERTIFICATE
 from filter.scene import DOUBT, Scene
 from pointgoal.observation import LIDAR_RANGE
 from system.backups import braking
+from system.certificate import CERTIFICATE
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -25,6 +26,33 @@ def _nowhere(n: int) -> IntArray:
     made = np.full(n, -1)
     made.setflags(write=False)
     return made
+
+
+_NOBODY = np.empty(0, np.int64)
+_MODES = np.concatenate(
+    [texts(mode, 1) for mode in (Mode.NOMINAL, Mode.GUIDED, *[Mode.FILTERED] * 2, *[Mode.FALLBACK] * 2)]
+)
+_ORIGINS = np.concatenate(
+    [
+        texts(origin, 1)
+        for origin in ("", Origin.GUIDE, Origin.BARRIER, Origin.CIRCULATION, *[Origin.HARM] * 2)
+    ]
+)
+"""What each outcome of `kernel.settle` is called."""
+
+
+class Led(NamedTuple):
+    """Who of N robots a guide leads.
+
+    Attributes:
+        which: (N,) who.
+        action: (N, 2) the references in place of their actions, and the nominal actions of the others.
+        hazard: (N,) what is in the way of those who are led, -1 for nothing.
+    """
+
+    which: BoolArray
+    action: FloatArray
+    hazard: IntArray
 
 
 class Step:
@@ -59,43 +87,47 @@ class Step:
         told = self.certificates, self.certified, memory, self.memory
         self.refused = kernel.screen(settings, scene.seen, scene.obstacles, nominal, active, *told)
 
-    @cached_property
-    def need(self) -> FloatArray:
-        """(N,) clearance [m] that certifies what the filter puts in place of a refused action.
+    def settle(self, led: Led | None, own: bool) -> tuple[IntArray, IntArray]:
+        """Decide about those who are led, and those whose actions have no certificate.
 
-        It is 0, or what there is, if that is a little less: a robot that has lost a millimetre of its margin
-        may keep what it has. A robot that is off needs the margin for what it may lose in a step.
+        With ``own``, our own solver solves the QPs; else nobody does.
+
+        Returns:
+            The rows that are left: for whom there may be a certified action, and for whom there is none.
         """
-        one = self.settings[0]
-        robot = one["robot"]
-        way = robot["gear"] * robot["force_limit"] / robot["drag"] * robot["physics_step"] * robot["substeps"]
-        inner = max(0.5 * (one["margin"] - one["sure"]) - one["travel_error"] * way, 0.0)
-        return np.asarray(np.minimum(np.maximum(self.scene.barrier, -inner), 0.0))
-
-    def certify(self, rows: IntArray, action: FloatArray, least: FloatArray) -> BoolArray:
-        """Whether some rows' actions (n, 2) have certificates that keep so much clearance (n,) [m]."""
-        scene = self.scene
-        kernel.certify(self.settings, scene.seen, scene.obstacles, rows, action, least, self.certificates)
-        return np.asarray(self.certificates["clearance"][rows] >= least)
-
-    def reference(self, rows: IntArray) -> FloatArray:
-        """What some rows' robots would be sent (n, 2), in the QP's variables."""
-        reference = self.action[rows]
-        reference[:, 0] /= self.settings["robot"]["force_limit"][0]
-        return np.minimum(np.maximum(reference, -1.0), 1.0)
-
-    def nearest(self, rows: IntArray) -> IntArray:
-        """The obstacles (n,) that bound some rows' last certificates; 0 where there is none."""
-        return np.asarray(np.maximum(self.certificates["nearest"][rows], 0))
-
-    def search(self, rows: IntArray) -> FloatArray:
-        """Look on a grid for the certified actions (n, 2) nearest to some rows'; see `kernel.search`."""
-        scene, found = self.scene, self.action[rows]
-        wanted = self.reference(rows)
-        kernel.search(
-            self.settings, scene.seen, scene.obstacles, rows, wanted, self.need, found, self.certificates
+        n, scene = len(self.nominal), self.scene
+        if led is None:
+            led = Led(np.zeros(n, np.bool_), self.nominal.copy(), np.full(n, -1))
+        self.action, self._hazard, outcome = led.action, led.hazard, np.empty(n, np.int8)
+        seen = self.settings, scene.seen, scene.obstacles, scene.source
+        left = kernel.settle(
+            *seen,
+            self.active,
+            self.certified,
+            led.which,
+            own,
+            self.action,
+            self._hazard,
+            self.certificates,
+            self.memory,
+            outcome,
         )
-        return found
+        self._mode, self._origin = _MODES[outcome], _ORIGINS[outcome]
+        if not left:
+            return _NOBODY, _NOBODY
+        return (outcome == kernel.OPEN).nonzero()[0], (outcome == kernel.HOPELESS).nonzero()[0]
+
+    def certify(self, k: int, action: FloatArray) -> bool:
+        """Whether an action (2,) is certified in place of robot k's, which was refused."""
+        scene, least = self.scene, kernel.needed(self.settings, self.scene.seen, k)
+        seen = self.settings, scene.seen, scene.obstacles
+        return bool(kernel.certify(*seen, k, action, least, self.certificates))
+
+    def search(self, rows: IntArray) -> tuple[FloatArray, BoolArray]:
+        """The certified actions (n, 2) of a grid nearest to some rows', and whether there is one (n,)."""
+        scene, found, done = self.scene, self.action[rows], np.empty(len(rows), np.bool_)
+        kernel.search(self.settings, scene.seen, scene.obstacles, rows, found, self.certificates, done)
+        return found, done
 
     def recover(self, rows: IntArray) -> tuple[FloatArray, NDArray[np.int8]]:
         """Actions (n, 2) that leave the most clearance or lead out, and what they are (n,): see `kernel`."""
@@ -126,22 +158,16 @@ class Step:
         if not rows.size:
             return
         if self._open is None:
-            self.action = self.nominal.copy()
-            self._mode, self._origin = self._mode.copy(), self._origin.copy()
             self._open = np.zeros(len(self.action), np.bool_)
+            if self.action is self.nominal:
+                self.action = self.nominal.copy()
+                self._mode, self._origin = self._mode.copy(), self._origin.copy()
         self.action[rows] = action
         self._mode[rows] = mode
         self._origin[rows] = origin
         self._open[rows] = True
         for k in rows if reason is not None else ():
             self._reason[k] = reason
-
-    def blame(self, rows: IntArray, hazard: IntArray) -> None:
-        """Name the hazards (n,) that some rows' interventions come from, -1 for none."""
-        if rows.size:
-            if not self._hazard.flags.writeable:
-                self._hazard = self._hazard.copy()
-            self._hazard[rows] = hazard
 
     def has_plan(self, rows: IntArray) -> BoolArray:
         """Which of some rows' robots came with a certified plan (n,)."""
@@ -180,7 +206,6 @@ class Step:
         """The step, decided, and the plans that the certificates end in written down."""
         n, memory = len(self.action), self.memory
         if self._open is not None:
-            memory["history"]["sent"][:, 0] = self.action
             sent = self._open, self.action, self.certificates
             kernel.keep_plans(self.settings, self.scene.seen, *sent, memory)
         return Decisions(

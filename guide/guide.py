@@ -9,7 +9,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from filter import FilterConfig, Step
+from filter import FilterConfig, Led, Step
 from filter.config import settings
 from guide.path import Path, drives_round, shortest_path, steer
 from pointgoal.observation import LIDAR_BINS
@@ -64,9 +64,6 @@ class GuideConfig:
                 raise ValueError(f"{name} must be in [0, 100), got {getattr(self, name)!r}")
 
 
-_NOBODY, _NOTHING = np.empty(0, np.int64), np.empty((0, 2))
-_ALONE = -2
-"""In place of the hazard in the way of a robot that is not led."""
 _OWN = tuple(GuideConfig.__dataclass_fields__)
 _OF_FILTER = ("margin", "position_error", "bearing_error", "hazard_radius")
 GUIDE = np.dtype([("robot", ROBOT), *((name, "f8") for name in (*_OF_FILTER, *_OWN))], align=True)
@@ -102,30 +99,15 @@ class Guide:
         for name in _OWN:
             self._settings[name] = getattr(own, name)
 
-    def propose(self, step: Step) -> tuple[IntArray, FloatArray]:
-        """The rows (n,) of the robots that are led, and the references (n, 2) in place of their actions."""
+    def propose(self, step: Step) -> Led | None:
+        """Who is led, and by which references in place of their actions; None: nobody."""
         scene, memory, ahead = step.scene, step.memory, self.strength == "ahead"
         if not ahead and (self.strength == "off" or not (step.refused or memory["guided"].any())):
-            return _NOBODY, _NOTHING
-        proposed, hazard = step.nominal.copy(), np.empty(len(scene), np.int64)
-        anyone = lead(
-            self._settings,
-            scene.seen,
-            scene.observation,
-            scene.columns,
-            scene.given,
-            step.active,
-            step.certified,
-            ahead,
-            memory,
-            proposed,
-            hazard,
-        )
-        if not anyone:
-            return _NOBODY, _NOTHING
-        rows = (hazard != _ALONE).nonzero()[0]
-        step.blame(rows, hazard[rows])
-        return rows, proposed[rows]
+            return None
+        n = len(scene)
+        led = Led(np.empty(n, np.bool_), step.nominal.copy(), np.empty(n, np.int64))
+        seen = self._settings, scene.seen, scene.observation, scene.columns, scene.given
+        return led if lead(*seen, step.active, step.certified, ahead, memory, *led) else None
 
 
 @compiled
@@ -189,6 +171,7 @@ def lead(
     certified: NDArray[np.bool_],
     ahead: bool,
     memory: Records,
+    led: NDArray[np.bool_],
     proposed: FloatArray,
     hazard: IntArray,
 ) -> bool:
@@ -204,9 +187,9 @@ def lead(
         certified: (N,) whose nominal action has a certificate.
         ahead: whether to lead whoever has something in the way, refused or not.
         memory: (N,) of `MEMORY`: the side on which a robot is being led past something is overwritten.
+        led: (N,) receives who is led.
         proposed: (N, 2) the nominal actions u1, u2; overwritten where it leads.
-        hazard: (N,) receives the hazard, or n + the bin, that is in the way of a robot that is led, -1 for
-            none; `_ALONE` of one that is not.
+        hazard: (N,) receives the hazard, or n + the bin, that is in the way of a robot that is led, else -1.
     """
     config = settings[0]
     _, _, first, last, goal = columns
@@ -214,7 +197,7 @@ def lead(
     discs, source = np.empty((size, 3)), np.empty(size, dtype=np.int64)
     for k in range(len(seen)):
         past = memory[k]
-        hazard[k] = _ALONE
+        led[k], hazard[k] = False, -1
         if not (active[k] and (ahead or past.guided != 0 or not certified[k])):
             past.guided = 0
             continue
@@ -229,12 +212,12 @@ def lead(
             goal_x, goal_y = in_own_frame(at[1], at[2], there)
             at = (at[0], goal_x, goal_y)
         engaged = ahead or past.guided != 0
-        leads, led, way = _leads(
+        leads, past_it, way = _leads(
             config, discs, count, at, state, proposed[k], not certified[k], engaged, ahead, past.guided
         )
-        past.guided = way.side if led else 0
+        past.guided = way.side if past_it else 0
         if leads:
-            anyone = True
+            led[k] = anyone = True
             hazard[k] = source[way.blocker] if way.blocker >= 0 else -1
             thrust, turn = steer(config, discs, count, state, way.x, way.y)
             proposed[k, 0] = thrust * config.robot.force_limit

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from filter import BarrierFilter, FilterConfig, SolverError
 from filter.qp import Problem
-from filter.solvers import KeptOSQP, make_solver, planar, solve_batch
+from filter.solvers import KeptOSQP, make_solver, planar, solve
 
 WEIGHTS = np.array([4.0, 1.0])
 
@@ -96,32 +96,16 @@ def test_a_feasible_problem_is_solved_by_each(name):
     np.testing.assert_allclose(make_solver(name)(free), [1.0, -0.2], atol=1e-6)
 
 
-def test_a_batch_is_solved_row_by_row_and_where_there_is_no_solution_the_reference_stays():
-    rng = np.random.default_rng(3)
-    problems = [random_problem(rng) for _ in range(60)]
-    most = max(len(problem.h) for problem in problems)
-    reference = np.array([problem.reference for problem in problems])
-    G, h = np.full((60, most, 2), np.nan), np.full((60, most), np.nan)
-    for k, problem in enumerate(problems):
-        G[k, : len(problem.h)], h[k, : len(problem.h)] = problem.G, problem.h
-    rows = np.array([len(problem.h) for problem in problems])
-    for name in ("planar", "quadprog"):
-        x, solved = solve_batch(make_solver(name), WEIGHTS, reference, G, h, rows)
-        assert 5 < solved.sum() < 55
-        for k, problem in enumerate(problems):
-            alone = planar(Problem(WEIGHTS, problem.reference, problem.G, problem.h))
-            assert solved[k] == (alone is not None)
-            np.testing.assert_allclose(x[k], reference[k] if alone is None else alone, atol=1e-6)
+def test_a_solver_that_breaks_down_or_lies_has_no_solution():
+    problem = Problem(WEIGHTS, np.zeros(2), np.array([[-1.0, -0.5]]), np.array([-0.4]))
 
-
-def test_a_solver_that_breaks_down_leaves_its_row_unsolved():
     def breaks(problem):
         raise SolverError(problem, "broken")
 
-    reference = np.array([[0.1, 0.2]])
-    x, solved = solve_batch(breaks, WEIGHTS, reference, np.zeros((1, 1, 2)), np.ones((1, 1)), np.array([1]))
-    assert not solved.any()
-    np.testing.assert_array_equal(x, reference)
+    assert solve(breaks, problem) is None
+    assert solve(lambda problem: np.zeros(2), problem) is None  # breaks the row
+    assert solve(lambda problem: np.full(2, np.nan), problem) is None
+    np.testing.assert_allclose(solve(planar, problem), [0.2, 0.4])
 
 
 def test_each_thread_has_workspaces_of_its_own():

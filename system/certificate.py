@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from filter.config import Settings
-from system.clearance import best_backup
+from system.clearance import Settings, best_backup
 from system.compiled import compiled
 from system.obstacles import FAR, least_gap
 from system.point_robot import State, advance, stopping
