@@ -35,18 +35,21 @@ class Faults:
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state, _lock=Lock())
 
-    def note(self, kind: str, message: str, error: BaseException | None = None) -> None:
+    def note(
+        self, kind: str, message: str, error: BaseException | None = None, internal: bool = True
+    ) -> None:
         """Count a fault, and log it if its kind was not logged for a minute.
 
         Args:
             kind: what it is counted under: "bad input", "network", or an exception's class.
             message: what happened.
             error: what was caught, for an internal fault: its traceback is logged.
+            internal: False where decisions do not hang on what failed.
         """
         now = time.monotonic()
         with self._lock:
             self.counts[kind] += 1
-            if error is not None:
+            if error is not None and internal:
                 self._internal.append(now)
             due = now - self._logged.get(kind, -_QUIET) >= _QUIET
             if due:

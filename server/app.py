@@ -38,7 +38,7 @@ BATCH_BODY = 16
 
 _REFUSALS: dict[int | str, dict[str, Any]] = {
     401: {"description": "no valid key"},
-    403: {"description": "a key for less than this"},
+    403: {"description": "a key for less than this, or another site's page"},
     413: {"description": "body too large"},
 }
 _ACT_LINKS: dict[int | str, dict[str, Any]] = {

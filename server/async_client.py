@@ -4,28 +4,25 @@ from __future__ import annotations
 
 import asyncio
 import http.client
-import math
 import ssl
-from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 from types import TracebackType
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from decision import Decision, Faults, Memory
-from server.address import Address, addresses
-from server.client import CONNECT_TIMEOUT, DEFAULT_TIMEOUT
+from decision import Decision, Memory
+from server.address import Address
+from server.base_client import CONNECT_TIMEOUT, BaseClient
 from server.link import MAX_REPLY
-from server.schema import ModelReply
-from server.session import MOST_FAILURES, ClientError, RefusedError, Session, excerpt
+from server.session import ClientError, RefusedError, Session, excerpt
 
 _MOST_HEAD = 16384
 """Most bytes of a reply's head."""
 
 
-class AsyncClient:
+class AsyncClient(BaseClient):
     """`server.Client` for asyncio: the same arguments, decisions, faults and hold; https and http alone.
 
     Connects on entering its context, which raises what the constructor of `Client` does.
@@ -34,39 +31,10 @@ class AsyncClient:
             decision = await client.decide(observation, memory=memory)
     """
 
-    def __init__(
-        self,
-        url: str | Sequence[str],
-        observation_layout: Sequence[Mapping[str, Any]] | None = None,
-        timeout: float = DEFAULT_TIMEOUT,
-        api_key: str | None = None,
-        robot: str | None = None,
-        most_failures: int | None = MOST_FAILURES,
-        raises: bool = False,
-        clock: Callable[[], float] | None = None,
-        ca_file: str | Path | None = None,
-    ) -> None:
-        if not (math.isfinite(timeout) and timeout > 0.0):
-            raise ValueError(f"timeout must be finite and positive, got {timeout}")
-        self._session = Session(observation_layout, robot, most_failures, raises, clock)
-        self._timeout = timeout
-        self._links = [_Link(each, self._session) for each in addresses(url, api_key, ca_file)]
+    def _begin(self, found: Sequence[Address]) -> None:
+        self._links = [_Link(address, self._session) for address in found]
         # One robot asks one thing at a time.
         self._turn = asyncio.Lock()
-
-    @property
-    def faults(self) -> Faults:
-        """What went wrong so far."""
-        return self._session.faults
-
-    @property
-    def held(self) -> str | None:
-        """Why it holds until `resume`, or None."""
-        return self._session.held
-
-    def model(self) -> ModelReply:
-        """What the service said about itself at connect."""
-        return self._session.model
 
     async def decide(
         self, observation: ArrayLike, hazards: ArrayLike | None = None, memory: Memory | np.void | None = None

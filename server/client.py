@@ -2,32 +2,25 @@
 
 from __future__ import annotations
 
-import math
 import time
-from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 from types import TracebackType
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from decision import Decision, Faults, Memory
-from server.address import Address, addresses
+from decision import Decision, Memory
+from server.address import Address
+from server.base_client import CONNECT_TIMEOUT, DEFAULT_TIMEOUT, BaseClient
 from server.link import Link, remaining
-from server.schema import ModelReply
-from server.session import MOST_FAILURES, ClientError, RefusedError, Session, excerpt
+from server.session import ClientError, RefusedError, Session, excerpt
 from server.stream import StreamLink
 
 __all__ = ["CONNECT_TIMEOUT", "DEFAULT_TIMEOUT", "Client", "ClientError"]
 
-DEFAULT_TIMEOUT = 0.02
-"""How long a robot waits for its action [s]: one control step, for which a certified action may last."""
-CONNECT_TIMEOUT = 5.0
-"""How long connecting may take before the robot moves [s]."""
 
-
-class Client:
+class Client(BaseClient):
     """One robot's connection to the service, with the `decide` of `monitor.Monitor`.
 
     `decide` raises nothing that comes from the service, the network or its arguments. Where it gets no good
@@ -62,44 +55,9 @@ class Client:
             `most_failures` is below 1.
     """
 
-    def __init__(
-        self,
-        url: str | Sequence[str],
-        observation_layout: Sequence[Mapping[str, Any]] | None = None,
-        timeout: float = DEFAULT_TIMEOUT,
-        api_key: str | None = None,
-        robot: str | None = None,
-        most_failures: int | None = MOST_FAILURES,
-        raises: bool = False,
-        clock: Callable[[], float] | None = None,
-        ca_file: str | Path | None = None,
-    ) -> None:
-        if not (math.isfinite(timeout) and timeout > 0.0):
-            raise ValueError(f"timeout must be finite and positive, got {timeout}")
-        self._session = Session(observation_layout, robot, most_failures, raises, clock)
-        self._timeout = timeout
-        self._links = [
-            (address, _link(address, self._session)) for address in addresses(url, api_key, ca_file)
-        ]
+    def _begin(self, found: Sequence[Address]) -> None:
+        self._links = [(address, _link(address, self._session)) for address in found]
         self._connect()
-
-    @property
-    def faults(self) -> Faults:
-        """What went wrong so far."""
-        return self._session.faults
-
-    @faults.setter
-    def faults(self, shared: Faults) -> None:
-        self._session.faults = shared
-
-    @property
-    def held(self) -> str | None:
-        """Why it holds until `resume`, or None."""
-        return self._session.held
-
-    def model(self) -> ModelReply:
-        """What the service said about itself at connect."""
-        return self._session.model
 
     def decide(
         self,

@@ -21,7 +21,7 @@ from server.states import TransitionError
 _REFUSED: dict[int | str, dict[str, Any]] = {
     400: {"description": "the body is no text"},
     401: {"description": "no valid key"},
-    403: {"description": "not the admin key"},
+    403: {"description": "not the admin key, or another site's page"},
     409: {"description": "not possible now; says why"},
 }
 _MOST_ERRORS = 8

@@ -13,15 +13,14 @@ from typing import Any, NamedTuple
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from server.keys import ACT, BATCH, OPEN_PATHS
+from server.keys import ACT, BATCH, HEALTH
 
-STREAM = "/act/stream"
 ANY_WORKER = frozenset({("POST", ACT), ("POST", BATCH), ("GET", "/model"), ("GET", "/openapi.json")})
 """What any worker answers alike: the memory travels with the robot, and all run the same bundle."""
-HEALTH = frozenset({("GET", path) for path in OPEN_PATHS})
 METRICS = "/metrics"
-ALL_WORKERS = frozenset({"/healthz", "/readyz", METRICS, "/alarms", "/robots"})
+ALL_WORKERS = HEALTH | {METRICS, "/alarms", "/robots"}
 """What is read of all workers."""
+_ANY_REPLICA = ANY_WORKER | {("GET", path) for path in HEALTH}
 HTTP_OK = 200
 _ANSWER_SECONDS = 0.5
 """How long a worker may take to tell the others what it knows [s]."""
@@ -95,17 +94,12 @@ class Crew:
         """Handles one connection."""
         assert self._app is not None
         path = scope["path"]
-        if scope["type"] == "http":
-            if (scope["method"], path) in ANY_WORKER:
-                await self._app(scope, receive, send)
-            elif scope["method"] == "GET" and path in ALL_WORKERS:
-                await _answer(send, await self.all(path))
-            else:
-                await _answer(send, _refusal(scope, "one of the workers alone: not with --workers"))
-        elif path == STREAM:
+        if scope["type"] != "http" or (scope["method"], path) in ANY_WORKER:  # a stream, or one of these
             await self._app(scope, receive, send)
+        elif scope["method"] == "GET" and path in ALL_WORKERS:
+            await _answer(send, await self.all(path))
         else:
-            await send({"type": "websocket.close", "code": 1008})
+            await _answer(send, _refusal(scope, "one of the workers alone: not with --workers"))
 
     async def all(self, path: str) -> Told:
         """What all workers answer to a GET, as one answer; the worst of their statuses is its."""
@@ -238,7 +232,7 @@ class Alike:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Handles one connection."""
-        if scope["type"] == "http" and (scope["method"], scope["path"]) not in ANY_WORKER | HEALTH:
+        if scope["type"] == "http" and (scope["method"], scope["path"]) not in _ANY_REPLICA:
             await _answer(send, _refusal(scope, "one of the replicas alone"))
         else:  # a stream, or one of these
             await self._app(scope, receive, send)

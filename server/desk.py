@@ -135,7 +135,11 @@ class Desk:
 
     def _tell(self, answered: Answered) -> None:
         for observer in self._observers:
-            observer.answered(answered)
+            try:
+                observer.answered(answered)
+            except Exception as error:  # noqa: BLE001 - whoever looks on may miss an answer, no robot may
+                kind = f"observer {type(observer).__name__}"
+                self._duty.now.monitor.faults.note(kind, "it missed an answer", error, internal=False)
 
     def answer(self, content: bytes, batch: bool) -> Answer:
         """The answer to the body of a `POST /act`, or of a `POST /act/batch`."""

@@ -7,13 +7,15 @@ what it owes, and where there are too many, the one that was heard of longest ag
 
 from __future__ import annotations
 
+import asyncio
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Protocol, cast
+from typing import Any, cast
 
 import httptools
+from uvicorn.config import Config
 from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol, RequestResponseCycle
 from uvicorn.server import ServerState
 
@@ -47,23 +49,6 @@ class Patience:
     robots: int = 512
 
 
-class Caller(Protocol):
-    """An open connection, whatever is spoken over it.
-
-    Attributes:
-        deadline: when it is closed, on the event loop's clock [s].
-    """
-
-    deadline: float
-
-    @property
-    def awaits_answer(self) -> bool:
-        """Whether it is not its turn to speak."""
-
-    def turn_away(self) -> None:
-        """Closes it."""
-
-
 class Door(ServerState):
     """The open connections of one service.
 
@@ -80,15 +65,15 @@ class Door(ServerState):
         self.patience = patience
         self._is_robots = is_robots
         # Both in order: whoever came, or was answered, longest ago is first.
-        self._newcomers: dict[Caller, None] = {}
-        self._robots: dict[Caller, None] = {}
+        self._newcomers: dict[Bounded, None] = {}
+        self._robots: dict[Bounded, None] = {}
 
-    def enter(self, connection: Caller) -> None:
+    def enter(self, connection: Bounded) -> None:
         """Lets a new connection in; the oldest newcomer makes room."""
         _make_room(self._newcomers, self.patience.robots)
         self._newcomers[connection] = None
 
-    def heard(self, connection: Caller, scope: Mapping[str, Any]) -> None:
+    def heard(self, connection: Bounded, scope: Mapping[str, Any]) -> None:
         """A whole request has come."""
         robot = connection in self._robots
         self.leave(connection)
@@ -98,7 +83,7 @@ class Door(ServerState):
         else:
             self._newcomers[connection] = None
 
-    def full(self, connection: Caller) -> bool:
+    def full(self, connection: Bounded) -> bool:
         """Whether there is no room for one more robot: all of them await their answers."""
         return (
             len(self._robots) >= self.patience.robots
@@ -106,7 +91,7 @@ class Door(ServerState):
             and _longest_idle(self._robots) is None
         )
 
-    def leave(self, connection: Caller) -> None:
+    def leave(self, connection: Bounded) -> None:
         """A connection is closed."""
         self._newcomers.pop(connection, None)
         self._robots.pop(connection, None)
@@ -117,32 +102,40 @@ class Door(ServerState):
         Args:
             now: on the event loop's clock [s].
         """
-        for connection in cast(set[Caller], self.connections).copy():
+        for connection in cast(set[Bounded], self.connections).copy():
             if connection.deadline < now:
                 connection.turn_away()
 
 
-class Connection(HttpToolsProtocol):
-    """uvicorn's connection, with a deadline for what the other side owes.
+class Bounded(asyncio.Protocol):
+    """A connection with a deadline for what the other side owes; stands before a protocol of uvicorn.
 
     Attributes:
         deadline: when it is closed, on the event loop's clock [s].
     """
 
     deadline = math.inf
+    loop: asyncio.AbstractEventLoop
     _reading = False
-    """Whether a request has begun and not all of it has come."""
-    _head = 0
-    """How many bytes of its head have come; -1 once the head is whole."""
+    """Whether a request or a frame has begun and not all of it has come."""
+    _clogged = False
+    """Whether the other side does not take what it is sent."""
+
+    def __init__(self, config: Config, server_state: ServerState, app_state: dict[str, Any]) -> None:
+        super().__init__(config, server_state, app_state)  # type: ignore[call-arg]  # uvicorn's, not object's
+        self._door = cast(Door, server_state)
 
     @property
     def awaits_answer(self) -> bool:
-        """Whether a whole request has come and is not answered yet."""
-        cycle = self.cycle
-        return cycle is not None and not cycle.more_body and not cycle.response_complete
+        """Whether it is not the other side's turn to speak."""
+        raise NotImplementedError
+
+    def turn_away(self) -> None:
+        """Closes it."""
+        raise NotImplementedError
 
     def connection_made(self, transport: Any) -> None:
-        """A new connection."""
+        """It begins."""
         super().connection_made(transport)
         self._allow(self._door.patience.read)
         self._door.enter(self)
@@ -151,6 +144,39 @@ class Connection(HttpToolsProtocol):
         """It is closed, by whichever side."""
         self._door.leave(self)
         super().connection_lost(exc)
+
+    def pause_writing(self) -> None:
+        """The other side does not take what it is sent."""
+        self._allow(self._door.patience.read)
+        self._clogged = True
+        super().pause_writing()
+
+    def resume_writing(self) -> None:
+        """It does again."""
+        self._clogged = False
+        super().resume_writing()
+        if self.awaits_answer:
+            self._allow(math.inf)
+        else:
+            self._allow(self._door.patience.read if self._reading else self._door.patience.idle)
+
+    def _allow(self, seconds: float) -> None:
+        """Sets the deadline, unless it is one for taking what was sent."""
+        if not self._clogged:
+            self.deadline = self.loop.time() + seconds
+
+
+class Connection(Bounded, HttpToolsProtocol):
+    """uvicorn's connection, with a deadline."""
+
+    _head = 0
+    """How many bytes of its head have come; -1 once the head is whole."""
+
+    @property
+    def awaits_answer(self) -> bool:
+        """Whether a whole request has come and is not answered yet."""
+        cycle = self.cycle
+        return cycle is not None and not cycle.more_body and not cycle.response_complete
 
     def data_received(self, data: bytes) -> None:
         """Some bytes have come."""
@@ -198,19 +224,6 @@ class Connection(HttpToolsProtocol):
             self._allow(self._door.patience.idle)
         super().on_response_complete()
 
-    def pause_writing(self) -> None:
-        """The other side does not take what it is sent."""
-        self._allow(self._door.patience.read)
-        super().pause_writing()
-
-    def resume_writing(self) -> None:
-        """It does again."""
-        super().resume_writing()
-        if self.awaits_answer:
-            self._allow(math.inf)
-        else:
-            self._allow(self._door.patience.read if self._reading else self._door.patience.idle)
-
     def turn_away(self) -> None:
         """Closes the connection, with a word to whoever is in the middle of a request."""
         if self.transport.is_closing() or self.transport.get_write_buffer_size():
@@ -243,21 +256,12 @@ class Connection(HttpToolsProtocol):
             return self.cycle is None or self.cycle.response_complete
         return not self.cycle.response_started and not self.pipeline
 
-    def _allow(self, seconds: float) -> None:
-        """Sets the deadline, unless it is one for taking what was sent."""
-        if not self.flow.write_paused:
-            self.deadline = self.loop.time() + seconds
 
-    @property
-    def _door(self) -> Door:
-        return cast(Door, self.server_state)
-
-
-def _longest_idle(connections: dict[Caller, None]) -> Caller | None:
+def _longest_idle(connections: dict[Bounded, None]) -> Bounded | None:
     return next((connection for connection in connections if not connection.awaits_answer), None)
 
 
-def _make_room(connections: dict[Caller, None], most: int) -> None:
+def _make_room(connections: dict[Bounded, None], most: int) -> None:
     """Makes room for one more, if one of them can go."""
     if len(connections) >= most and (idle := _longest_idle(connections)) is not None:
         del connections[idle]

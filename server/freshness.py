@@ -72,13 +72,13 @@ class Unfit:
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """What is known of one robot.
+    """What is known of one robot, as `GET /robots` tells it.
 
     Attributes:
         robot: its name.
-        state: where it stands.
-        reason: why it is stale or held, else None.
-        age: of its last observation whose stamp could be read [s]; None: there was none.
+        state: fresh, stale, held, silent.
+        reason: why it is stale or held, else null.
+        age: how old its last observation was when it came [s]; null: that cannot be told.
         ago: when it last asked [s].
         requests: how often it has asked.
         late: how many of its requests in a row were late or are missing.

@@ -11,10 +11,9 @@ from typing import Any
 from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from server.keys import ACT, BATCH, HOLD, MODEL, RESUME, STREAM, Keys, Level, needed
+from server.keys import ACT, BATCH, STREAM, Keys, Level, needed
+from server.origin import is_foreign, is_own
 
-ADMIN_PATHS = frozenset({MODEL, HOLD, RESUME})
-"""Whoever posts there needs the admin key. Where there is none it is refused: any page in a browser could."""
 AT_ONCE = "lagnet.at_once"
 """The ASGI extension by which the server takes status and body of a JSON reply at once: True if it did."""
 FULL = "lagnet.full"
@@ -33,6 +32,8 @@ class BodyTooLargeError(ValueError):
 
 class Guard:
     """Refuses requests without a key (401), with one for less (403), without a place (503), too large (413).
+
+    Pages of other sites, by which a browser would ask for its user, are refused as well (403).
 
     Args:
         app: what it guards.
@@ -62,13 +63,8 @@ class Guard:
         if scope["type"] == "websocket":
             await self._stream(headers, scope, receive, send)
             return
-        wanted = needed(scope)
-        if wanted and (granted := self._keys.granted(headers)) < wanted:
-            status, message = _not_allowed(granted, wanted)
-            await self._refuse(send, status, "header", "authorization", message)
-            return
-        if scope["path"] in ADMIN_PATHS and scope["method"] == "POST" and self._keys.admin is None:
-            await self._refuse(send, 403, "header", "authorization", "the service has no admin key")
+        if (stranger := self._stranger(scope, headers)) is not None:
+            await self._refuse(send, *stranger)
             return
         if scope["path"] in (ACT, BATCH) and scope.get("extensions", {}).get(FULL):
             await self._refuse(send, 503, "connection", "limit", "every connection awaits its answer")
@@ -91,9 +87,8 @@ class Guard:
         if scope["path"] != STREAM:
             message = f"the stream is at {STREAM}"
             await self._refuse(send, 404, "path", scope["path"], message, _HANDSHAKE)
-        elif (granted := self._keys.granted(headers)) < Level.ACT:
-            status, message = _not_allowed(granted, Level.ACT)
-            await self._refuse(send, status, "header", "authorization", message, _HANDSHAKE)
+        elif (stranger := self._stranger(scope, headers)) is not None:
+            await self._refuse(send, *stranger, _HANDSHAKE)
         elif b"origin" in headers:
             # Browsers let any page open a stream to any host, and say whose page it is.
             message = "the stream is not for browsers"
@@ -105,19 +100,35 @@ class Guard:
         """Whether a request is one that only a robot makes: for a decision, with the key."""
         if scope["path"] not in (ACT, BATCH, STREAM):
             return False
-        return self._keys.granted(dict(scope["headers"])) >= Level.ACT
+        return self._stranger(scope, dict(scope["headers"])) is None
+
+    def _stranger(
+        self, scope: Mapping[str, Any], headers: Mapping[bytes, bytes]
+    ) -> tuple[int, str, str, str] | None:
+        """Why whoever asks may not, as `_refuse` tells it."""
+        # No browser sends a key by itself: where there is one, a name that leads here is of no use.
+        if not self._keys.any and not is_own(headers.get(b"host", b"")):
+            return 403, "header", "host", "without a key the service answers to localhost and addresses alone"
+        wanted = needed(scope)
+        if wanted and (granted := self._keys.granted(headers)) < wanted:
+            status, message = self._not_allowed(granted, wanted)
+            return status, "header", "authorization", message
+        if is_foreign(scope.get("method", "GET"), headers):
+            return 403, "header", "origin", "another site's page may not ask for this"
+        return None
+
+    def _not_allowed(self, granted: Level, wanted: Level) -> tuple[int, str]:
+        if granted == Level.NOTHING:
+            return 401, "a valid API key is required"
+        if wanted == Level.ADMIN and self._keys.admin is None:
+            return 403, "the service has no admin key"
+        return 403, f"this takes the {wanted.name.lower()} key, not the {granted.name.lower()} key"
 
     async def _refuse(
         self, send: Send, status: int, place: str, name: str, message: str, kind: str = "http.response"
     ) -> None:
         self.refusals[status] += 1
         await _refuse(send, status, place, name, message, kind)
-
-
-def _not_allowed(granted: Level, wanted: Level) -> tuple[int, str]:
-    if granted == Level.NOTHING:
-        return 401, "a valid API key is required"
-    return 403, f"this takes the {wanted.name.lower()} key, not the {granted.name.lower()} key"
 
 
 def _too_large(max_body: int) -> str:

@@ -13,8 +13,8 @@ ACT, BATCH, STREAM = "/act", "/act/batch", "/act/stream"
 MODEL, HOLD, RESUME, ALARMS = "/model", "/hold", "/resume", "/alarms"
 HOME, PAGE = "/", "/page/"
 """The live page, and what its files' paths begin with: they hold no secret."""
-OPEN_PATHS = frozenset({"/healthz", "/readyz", HOME})
-"""What an orchestrator, and a browser that was not told a key yet, may ask without one."""
+HEALTH = frozenset({"/healthz", "/readyz"})
+"""What an orchestrator asks."""
 
 
 class Level(IntEnum):
@@ -37,19 +37,19 @@ def needed(scope: Mapping[str, Any]) -> Level:
         return Level.ACT
     if path.startswith(f"{ALARMS}/"):
         return Level.ACT  # whoever drives robots says that an alarm was seen
-    if path in OPEN_PATHS or path.startswith(PAGE):
+    if path in HEALTH or path == HOME or path.startswith(PAGE):
         return Level.NOTHING
     return Level.READ if scope.get("method", "GET") in ("GET", "HEAD") else Level.ADMIN
 
 
 @dataclass(frozen=True)
 class Keys:
-    """The keys of a service. Without any, everybody may do everything.
+    """The keys of a service. Without any, everybody may read and ask for decisions.
 
     Attributes:
         read: for `Level.READ`; None: there is none, and only the higher ones read.
         act: for `Level.ACT` as well.
-        admin: for everything. Without it, and with another, nobody may change anything.
+        admin: for everything. Without it nobody may change anything.
 
     Raises:
         ValueError: if two are the same, or there is a key to read and none to act.
@@ -79,7 +79,7 @@ class Keys:
     def granted(self, headers: Mapping[bytes, bytes]) -> Level:
         """What whoever sends these headers may do; every key is compared, in constant time."""
         if not self._levels:
-            return Level.ADMIN
+            return Level.ACT
         scheme, _, bearer = headers.get(b"authorization", b"").partition(b" ")
         given = bearer.strip() if scheme.lower() == b"bearer" else headers.get(b"x-api-key", b"")
         granted = Level.NOTHING

@@ -193,7 +193,7 @@ class Hub:
         patience: how long a watcher may leave an update unread [s].
 
     Attributes:
-        faults: what went wrong here so far.
+        faults: what went wrong with the streams so far.
     """
 
     def __init__(
@@ -227,13 +227,7 @@ class Hub:
         return len(self._watchers)
 
     def answered(self, answered: Answered) -> None:
-        """Takes note of the decisions of one request; whatever fails here costs no robot its answer."""
-        try:
-            self._note(answered)
-        except Exception as error:  # noqa: BLE001 - the page may go, the service may not
-            self.faults.note(type(error).__name__, "a decision is not on the page", error)
-
-    def _note(self, answered: Answered) -> None:
+        """Takes note of the decisions of one request."""
         now = self._clock()
         robots, seconds = self._robots, answered.seconds
         for place, (asked, decision) in enumerate(zip(answered.asked, answered.decisions, strict=False)):

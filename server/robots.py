@@ -8,33 +8,11 @@ from typing import Annotated, Any
 from fastapi import APIRouter, HTTPException, Path
 from pydantic import BaseModel
 
-from server.freshness import Freshness, RobotState
+from server.freshness import Freshness, RobotState, Seen
 from server.keeper import Keeper
 
 RESET = "reset_robot"
 """The id of the operation that ends a hold, for links to it."""
-
-
-class RobotReply(BaseModel):
-    """What is known of one robot; see `server.freshness.Seen`.
-
-    Attributes:
-        robot: its name.
-        state: fresh, stale, held, silent.
-        reason: why it is stale or held, else null.
-        age: how old its last observation was when it came [s]; null: that cannot be told.
-        ago: when it last asked [s].
-        requests: how often it has asked.
-        late: how many of its requests in a row were late or are missing.
-    """
-
-    robot: str
-    state: RobotState
-    reason: str | None
-    age: float | None
-    ago: float
-    requests: int
-    late: int
 
 
 class RobotsReply(BaseModel):
@@ -44,7 +22,7 @@ class RobotsReply(BaseModel):
         robots: those that are known; whoever asked last comes last.
     """
 
-    robots: list[RobotReply]
+    robots: list[Seen]
 
 
 def robots_router(
@@ -61,8 +39,7 @@ def robots_router(
 
     @router.get("/robots")
     async def robots() -> RobotsReply:
-        seen = freshness.robots(time.perf_counter())
-        return RobotsReply(robots=[RobotReply.model_validate(each, from_attributes=True) for each in seen])
+        return RobotsReply(robots=freshness.robots(time.perf_counter()))
 
     @router.post(
         "/robots/{name}/reset",

@@ -3,50 +3,26 @@
 from __future__ import annotations
 
 import math
-from typing import Any, cast
+from typing import Any
 
-from uvicorn.config import Config
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
-from uvicorn.server import ServerState
 
-from server.door import MAX_AHEAD, Door
+from server.door import MAX_AHEAD, Bounded
 
 _TRY_AGAIN_LATER = 1013
 _POLICY_VIOLATION = 1008
 
 
-class StreamConnection(WebSocketsSansIOProtocol):
-    """uvicorn's WebSocket, with a deadline for what the other side owes, see `server.door.Connection`.
+class StreamConnection(Bounded, WebSocketsSansIOProtocol):
+    """uvicorn's WebSocket, with a deadline."""
 
-    Attributes:
-        deadline: when it is closed, on the event loop's clock [s].
-    """
-
-    deadline = math.inf
     _ahead = 0
     """Frames that have come and are not answered yet."""
-    _reading = False
-    """Whether a frame has begun and not all of it has come."""
-
-    def __init__(self, config: Config, server_state: ServerState, app_state: dict[str, Any]) -> None:
-        super().__init__(config, server_state, app_state)
-        self._door = cast(Door, server_state)
 
     @property
     def awaits_answer(self) -> bool:
         """Whether a whole frame has come and is not answered yet."""
         return self._ahead > 0
-
-    def connection_made(self, transport: Any) -> None:
-        """It was an HTTP connection, and has asked to be a stream."""
-        super().connection_made(transport)
-        self._allow(self._door.patience.read)
-        self._door.enter(self)
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        """It is closed, by whichever side."""
-        self._door.leave(self)
-        super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
         """Some bytes have come."""
@@ -95,16 +71,6 @@ class StreamConnection(WebSocketsSansIOProtocol):
         if not self._ahead:
             self._allow(self._door.patience.read if self._reading else self._door.patience.idle)
 
-    def pause_writing(self) -> None:
-        """The other side does not take what it is sent."""
-        self._allow(self._door.patience.read)
-        super().pause_writing()
-
-    def resume_writing(self) -> None:
-        """It does again."""
-        super().resume_writing()
-        self._allow(math.inf if self._ahead else self._door.patience.idle)
-
     def turn_away(self) -> None:
         """Closes the connection."""
         if self.transport.is_closing() or self.transport.get_write_buffer_size():
@@ -119,8 +85,3 @@ class StreamConnection(WebSocketsSansIOProtocol):
             self.transport.write(b"".join(self.conn.data_to_send()))
             self.close_sent = True
         self.transport.close()
-
-    def _allow(self, seconds: float) -> None:
-        """Sets the deadline, unless it is one for taking what was sent."""
-        if self.writable.is_set():
-            self.deadline = self.loop.time() + seconds

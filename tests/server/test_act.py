@@ -21,6 +21,8 @@ from monitor import Monitor
 from server.alarms import RULES
 from server.app import Lifecycle, create_app
 from server.keys import Keys
+from server.live import Hub
+from server.operation import Operation
 from server.schema import ActReply, decision_of, reply_of
 
 MANY_FAULTS = int(RULES["faults"].limit) + 1
@@ -218,6 +220,29 @@ def test_an_action_that_is_no_number_never_leaves_and_the_service_degrades(
     assert (reply.json()["status"], reply.json()["why"]) == ("degraded", "alarm faults")
     assert app.get("/healthz").status_code == 200
     assert len(caplog.records) == 1
+
+
+def test_an_observer_that_fails_costs_no_answer_and_no_other_observer_its_own(
+    monitor, observation, monkeypatch, caplog
+) -> None:
+    """It is counted, logged once, and no reason to send robots elsewhere."""
+
+    def broken(*_: object) -> None:
+        raise AttributeError("a programming error")
+
+    told, heard = Told(monitor), []
+    operation = Operation(told)
+    monkeypatch.setattr(operation.tally, "answered", broken)
+    monkeypatch.setattr(Hub, "answered", lambda hub, answered: heard.append(answered.status))
+    app = TestClient(create_app(told, operation=operation))
+    for _ in range(MANY_FAULTS):
+        assert app.post("/act", json={"observation": observation}).status_code == 200
+    assert heard == [200] * MANY_FAULTS
+    assert told.faults.counts == {"observer Tally": MANY_FAULTS}
+    assert "a programming error" in caplog.text
+    assert len(caplog.records) == 1
+    assert app.get("/readyz").status_code == 200
+    assert f'lagnet_faults_total{{kind="observer Tally"}} {MANY_FAULTS:.1f}' in app.get("/metrics").text
 
 
 def test_faults_inside_the_monitor_degrade_the_service_and_bad_input_does_not(

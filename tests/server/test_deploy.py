@@ -25,6 +25,7 @@ from fastapi.testclient import TestClient
 from evaluation.service import Service
 from monitor import Monitor
 from recorder import Recorder, Settings
+from server import Client
 from server.app import create_app
 from server.crew import Crew
 from server.keys import Keys
@@ -232,4 +233,31 @@ def test_nginx_hands_a_robots_requests_on_over_one_connection(
             assert (reply.status, json.loads(reply.read())["gate"]) == (200, "always")
             first = first or link.sock
             assert link.sock is first
+        link.close()
+
+
+@needs("nginx")
+@needs("openssl")
+def test_through_nginx_robots_stream_and_the_page_is_of_the_same_site(
+    tiny_bundle: Path, observation: list[float], tmp_path: Path
+) -> None:
+    with Service.start(tiny_bundle, "always") as service, nginx_before(service, tmp_path) as port:
+        certificate = tmp_path / "tls.crt"
+        with Client(f"wss://localhost:{port}", timeout=5.0, ca_file=certificate) as robot:
+            memory = None
+            for _ in range(3):
+                decision = robot.decide(observation, memory=memory)
+                assert (decision.opened_by, decision.reason) == ("always", None)
+                memory = decision.memory
+            assert not robot.faults.counts
+        context = ssl.create_default_context(cafile=certificate)
+        link = http.client.HTTPSConnection("localhost", port, context=context, timeout=10.0)
+        path = "/alarms/latency/acknowledge"
+        for origin, status in ((f"https://localhost:{port}", 200), ("https://localhost", 403)):
+            link.request("POST", path, "{}", {"origin": origin})
+            reply = link.getresponse()
+            reply.read()
+            assert reply.status == status, origin
+        link.request("GET", "/live")
+        assert link.getresponse().readline() == b"event: about\n"
         link.close()

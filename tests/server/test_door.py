@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import uvicorn
@@ -21,7 +22,7 @@ from starlette.types import Receive, Scope, Send
 from evaluation.service import Service
 from server import Client
 from server.app import MAX_BODY, Lifecycle, create_app
-from server.door import MAX_HEAD, Connection, Door, Patience
+from server.door import MAX_HEAD, Bounded, Connection, Door, Patience
 from server.guard import Guard
 from server.keys import Keys
 from server.serve import DrainingServer, ServeConfig, ServeError, allow_files, listen, serve
@@ -318,6 +319,28 @@ def test_whoever_does_not_take_the_reply_is_closed_in_time(connect: Connect, req
                 received += len(part)
         assert received < 20_000_000
         assert answered(taker, HEALTH).status == 200
+
+
+def test_taking_a_reply_late_gives_no_more_time_for_what_has_begun() -> None:
+    """Of a request as of a stream's frame."""
+
+    class Plain(asyncio.Protocol):
+        def __init__(self, *_: object) -> None:
+            self.loop = SimpleNamespace(time=lambda: 100.0)
+
+    class Caller(Bounded, Plain):
+        awaits_answer = False
+
+    one = Caller(uvicorn.Config("app"), Door(Patience(read=5.0, idle=75.0), lambda scope: True), {})
+    one._reading = True
+    one.pause_writing()
+    one._allow(75.0)
+    assert one.deadline == 105.0
+    one.resume_writing()
+    assert one.deadline == 105.0
+    one._reading = False
+    one._allow(75.0)
+    assert one.deadline == 175.0
 
 
 @pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), float("inf")])

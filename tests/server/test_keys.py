@@ -28,17 +28,28 @@ def test_each_key_does_what_the_lower_ones_do_and_no_more(monitor, observation, 
         "act": [("POST", "/act"), ("POST", "/act/batch"), ("GET", "/act"), ("POST", "/act/")],
         "admin": [("POST", "/robots/nobody/reset"), ("DELETE", "/model"), ("PUT", "/nowhere")],
     }
+    without = 0 if given else level_of("act")
     for role, sent in product((None, *ROLES, "wrong"), requests):
-        valid = level_of(role) if role in given else 0
+        valid = level_of(role) if role in given else without
         for method, path in requests[sent]:
             headers = {} if role is None else {"authorization": f"Bearer {role}"}
             status = app.request(method, path, json=asked, headers=headers).status_code
-            if not given or valid >= level_of(sent):
+            if valid >= level_of(sent):
                 assert status not in (401, 403), (role, path)
             else:
                 assert status == (403 if valid else 401), (role, path)
     for path in ("/healthz", "/readyz"):
         assert app.get(path).status_code == 200
+
+
+@pytest.mark.parametrize("act", [None, "act"])
+@pytest.mark.parametrize("path", ["/hold", "/resume", "/model", "/robots/one/reset", "/nowhere"])
+def test_without_an_admin_key_nobody_changes_anything(monitor, path: str, act: str | None) -> None:
+    """Whatever the path is; and whoever may ask is told why."""
+    service = TestClient(create_app(monitor, keys=Keys(act=act)))
+    reply = service.post(path, json={}, headers={"x-api-key": "act"})
+    assert (reply.status_code, reply.json()["detail"][0]["msg"]) == (403, "the service has no admin key")
+    assert service.post(path, headers={"x-api-key": "wrong"}).status_code == (403 if act is None else 401)
 
 
 def test_every_path_of_the_service_takes_a_key_but_the_two(monitor) -> None:

@@ -200,12 +200,12 @@ def test_a_fault_of_the_page_ends_its_streams_alone(views, decision) -> None:
     asyncio.run(watch())
 
 
-def test_what_the_hub_cannot_take_note_of_costs_no_robot_its_answer(views, decision) -> None:
+def test_an_address_may_be_a_list(views, decision) -> None:
+    """As some servers give it."""
     hub = Hub(views, Standing(), {})
-    hub.answered(answered(asks(), decision, client=["a server may give a list", 1]))
-    assert not hub.faults.counts
-    hub.answered(answered(asks(), None))
-    assert hub.faults.counts["AttributeError"] == 1
+    hub.answered(answered(asks(), decision, client=["h", 1]))
+    [_, update] = asyncio.run(told(hub))
+    assert list(update["robots"]) == ["h:1/1"]
 
 
 def test_the_view_is_what_the_filter_sees(hand, monitor: Monitor, views: Views) -> None:

@@ -11,9 +11,11 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from http.client import HTTPConnection, HTTPException
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlsplit
+from urllib.request import urlopen
 
 import numpy as np
 import pytest
@@ -318,6 +320,43 @@ def test_a_service_with_a_key_is_read_with_it(opened: Any, monitor: Monitor) -> 
         assert "secret" not in page.evaluate("JSON.stringify({...localStorage}) + location.href")
     finally:
         service.stop()
+
+
+def test_our_page_may_change_what_it_shows_and_anothers_may_not(opened: Any, tiny_bundle: Path) -> None:
+    """A post as any page may send it without asking first, to a service without a key."""
+    script = (
+        "(url) => fetch(url, {method: 'POST', body: '{}', mode: 'no-cors'}).then((reply) => reply.status)"
+    )
+    with Service.start(tiny_bundle, "always") as service, elsewhere() as other:
+        url = f"{service.url}/alarms/latency/acknowledge"
+        assert opened(service.url).evaluate(script, url) == 200
+        assert 'lagnet_refusals_total{status="403"}' not in scrape(service.url)
+        # What is answered it cannot see.
+        assert opened(other, bears=("403",)).evaluate(script, url) == 0
+        assert 'lagnet_refusals_total{status="403"} 1.0' in scrape(service.url)
+
+
+@contextmanager
+def elsewhere() -> Iterator[str]:
+    """A page of another site."""
+
+    class Page(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.send_response(200)
+            self.end_headers()
+
+        def log_message(self, *_: object) -> None:
+            pass
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Page) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_port}"
+        server.shutdown()
+
+
+def scrape(url: str) -> str:
+    with urlopen(f"{url}/metrics", timeout=10.0) as reply:
+        return str(reply.read().decode())
 
 
 def test_robots_are_chosen_by_keyboard(opened: Any, service: Running) -> None:

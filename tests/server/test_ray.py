@@ -81,9 +81,10 @@ def test_a_replica_answers_what_the_service_does(monitor, tiny_bundle: Path, obs
     assert mine.bundle.id == monitor.bundle.id
     key = {"x-api-key": "sesame"}
     assert service.get("/readyz").status_code == service.get("/model", headers=key).status_code == 200
-    refused = service.get("/robots", headers=key)
-    assert refused.status_code == 501
-    assert refused.json()["detail"][0]["msg"] == "GET /robots would reach one of the replicas alone"
+    for path in ("/robots", "/live", "/"):
+        refused = service.get(path, headers=key)
+        assert refused.status_code == 501
+        assert refused.json()["detail"][0]["msg"] == f"GET {path} would reach one of the replicas alone"
     # Another replica may have seen the robot's last stamp.
     reply = service.post("/act", json=asked | {"robot": "one", "stamp": 1.0}, headers=key).json()
     assert (reply["mode"], reply["opened_by"]) == ("fallback", "fault")
