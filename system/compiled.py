@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
+import numba.extending
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -21,6 +22,19 @@ _ROOMS = ("decision", "system", "filter", "guide", "inference", "novelty", "moni
 def compiled(function: Function) -> Function:
     """Compile a helper that only compiled functions call; it becomes part of their machine code."""
     return cast(Function, numba.njit(error_model="numpy")(function))
+
+
+def by_precision(single: Callable[..., Any], double: Callable[..., Any]) -> Callable[..., Any]:
+    """A helper of one number ``x`` that is one function for float32, another for float64."""
+
+    def choose(x: Any) -> Any:
+        raise NotImplementedError("for compiled code alone")
+
+    def chosen(x: Any) -> Callable[..., Any]:
+        return single if x == numba.types.float32 else double
+
+    numba.extending.overload(choose, jit_options={"error_model": "numpy"}, strict=False)(chosen)
+    return choose
 
 
 def entry(function: Function) -> Function:

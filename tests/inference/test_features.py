@@ -83,6 +83,16 @@ def test_they_are_torchs_features_on_what_is_tried_at_load(real) -> None:
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=2e-5)
 
 
+@pytest.mark.parametrize("lidar", [GOAL, HAZARDS])
+def test_they_are_torchs_features_where_bearings_are_many_turns(lidar) -> None:
+    rng = np.random.default_rng(5)
+    observation = rng.random((200, 60))
+    observation[:, lidar] = -rng.random((200, 16))
+    observation[np.arange(200), lidar.start + rng.integers(0, 16, 200)] = 1e-6
+    found, expected = both(observation, 0.25, np.float32)
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=2e-5)
+
+
 @pytest.mark.parametrize("real", PRECISIONS)
 def test_a_row_of_a_batch_is_what_it_is_alone(real) -> None:
     features = Features(numbers(LEARNT[0.25]), real)
