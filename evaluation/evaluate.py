@@ -53,7 +53,7 @@ class EvaluateConfig:
     """Whether the gate `risk` opens where the barrier is low, whatever λ says. Without, nothing is certified
     where λ is silent: to measure what λ is worth."""
     guide: Strength | None = None
-    """How much the guide may do: nothing, lead from a refused action on (the default), lead ahead."""
+    """How much the guide may do: nothing, lead from a refused action on, lead ahead (the default)."""
     hazards: Literal["lidar", "given", "both"] = "lidar"
     """What the filter knows of the hazards. A PointGoal task promises a robot its lidar alone; given: their
     places in the body frame as well; both: the same episodes with either."""
