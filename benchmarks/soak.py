@@ -59,34 +59,36 @@ class Soaked:
     """What came of it.
 
     Attributes:
-        memory: of the service, once a second: seconds, decisions so far and [MB].
+        memory: of the service, once a second: seconds, decisions so far, [MB], and what of it waits to be
+            recorded [MB].
         decisions: how many were asked for.
         seconds: for how long.
         faults: of the clients, by kind.
         violating_steps: how many.
         counted: decisions by the service's metrics.
         recorded: by its recording.
-        waiting: the most that waited to be recorded, which is in the service's memory [MB].
         complaints: what the service wrote to its standard error.
     """
 
-    memory: list[tuple[float, int, float]] = field(default_factory=list)
+    memory: list[tuple[float, int, float, float]] = field(default_factory=list)
     decisions: int = 0
     seconds: float = 0.0
     faults: dict[str, int] = field(default_factory=dict)
     violating_steps: int = 0
     counted: int = 0
     recorded: int = 0
-    waiting: float = 0.0
     complaints: str = ""
 
     @property
     def growth(self) -> float:
-        """How much the memory grew once settled, by a straight line [MB a million decisions]."""
+        """How much the memory grew once settled, by a straight line [MB a million decisions].
+
+        What waits to be recorded is bounded, comes and goes, and is left out.
+        """
         settled = np.array([row for row in self.memory if row[0] >= _SETTLED * self.seconds])
         if len(settled) < 3:
             return float("nan")
-        return float(np.polyfit(settled[:, 1] / 1e6, settled[:, 2], 1)[0])
+        return float(np.polyfit(settled[:, 1] / 1e6, settled[:, 2] - settled[:, 3], 1)[0])
 
 
 def resident(process: int) -> float:
@@ -152,8 +154,8 @@ def _look(service: Service, came: Soaked, begun: float, over: threading.Event) -
     """Notes the memory once a second, and scrapes the metrics."""
     while not over.wait(1.0):
         seconds, process = time.monotonic() - begun, service.process.pid
-        came.memory.append((seconds, came.decisions, resident(process)))
-        came.waiting = max(came.waiting, _recording(service.url)["waiting"] / 1e6)
+        waiting = _recording(service.url)["waiting"] / 1e6
+        came.memory.append((seconds, came.decisions, resident(process), waiting))
         _counted(service.url)
 
 
@@ -193,6 +195,7 @@ def main() -> None:
     came = soak(config)
     table = Table("", "")
     first, last = came.memory[0][2], came.memory[-1][2]
+    waiting = max(row[3] for row in came.memory)
     grew = f"{first:.0f} at first, {last:.0f} at last; once settled {came.growth:+.1f} a million decisions"
     for name, value in (
         ("decisions", f"{came.decisions:,} in {came.seconds / 60.0:.1f} min"),
@@ -200,7 +203,7 @@ def main() -> None:
         ("violating steps", f"{came.violating_steps}"),
         ("clients' faults", json.dumps(came.faults)),
         ("counted by /metrics", f"{came.counted:,}"),
-        ("recorded", f"{came.recorded:,}; at most {came.waiting:.1f} MB waited to be"),
+        ("recorded", f"{came.recorded:,}; at most {waiting:.1f} MB waited to be"),
         ("the service's complaints", came.complaints or "none"),
     ):
         table.add_row(name, value)
