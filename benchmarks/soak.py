@@ -18,7 +18,7 @@ import time
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 from urllib.request import urlopen
 
 import numpy as np
@@ -59,7 +59,8 @@ class Soaked:
     """What came of it.
 
     Attributes:
-        memory: of the service, once a second: seconds and [MB].
+        memory: of the service, once a second: seconds, decisions so far, [MB], and what of it waits to be
+            recorded [MB].
         decisions: how many were asked for.
         seconds: for how long.
         faults: of the clients, by kind.
@@ -69,7 +70,7 @@ class Soaked:
         complaints: what the service wrote to its standard error.
     """
 
-    memory: list[tuple[float, float]] = field(default_factory=list)
+    memory: list[tuple[float, int, float, float]] = field(default_factory=list)
     decisions: int = 0
     seconds: float = 0.0
     faults: dict[str, int] = field(default_factory=dict)
@@ -80,12 +81,14 @@ class Soaked:
 
     @property
     def growth(self) -> float:
-        """How much the memory grew once settled, by a straight line through its samples [MB]."""
+        """How much the memory grew once settled, by a straight line [MB a million decisions].
+
+        What waits to be recorded is bounded, comes and goes, and is left out.
+        """
         settled = np.array([row for row in self.memory if row[0] >= _SETTLED * self.seconds])
         if len(settled) < 3:
             return float("nan")
-        slope = np.polyfit(settled[:, 0], settled[:, 1], 1)[0]
-        return float(slope * (settled[-1, 0] - settled[0, 0]))
+        return float(np.polyfit(settled[:, 1] / 1e6, settled[:, 2] - settled[:, 3], 1)[0])
 
 
 def resident(process: int) -> float:
@@ -150,7 +153,9 @@ def _drive(url: str, config: SoakBenchmark, came: Soaked, begun: float) -> None:
 def _look(service: Service, came: Soaked, begun: float, over: threading.Event) -> None:
     """Notes the memory once a second, and scrapes the metrics."""
     while not over.wait(1.0):
-        came.memory.append((time.monotonic() - begun, resident(service.process.pid)))
+        seconds, process = time.monotonic() - begun, service.process.pid
+        waiting = _recording(service.url)["waiting"] / 1e6
+        came.memory.append((seconds, came.decisions, resident(process), waiting))
         _counted(service.url)
 
 
@@ -171,11 +176,17 @@ def _recorded(url: str, expected: int, patience: float = 10.0) -> int:
     """What the recording has taken; it is told a moment later."""
     end = time.monotonic() + patience
     while True:
-        with urlopen(f"{url}/healthz") as reply:
-            recorded = int(json.load(reply)["recording"].get("recorded", 0))
+        recorded = int(_recording(url).get("recorded", 0))
         if recorded >= expected or time.monotonic() > end:
             return recorded
         time.sleep(0.1)
+
+
+def _recording(url: str) -> dict[str, Any]:
+    """How the recording stands."""
+    with urlopen(f"{url}/healthz") as reply:
+        told: dict[str, Any] = json.load(reply)["recording"]
+    return told
 
 
 def main() -> None:
@@ -183,14 +194,16 @@ def main() -> None:
     config = tyro.cli(SoakBenchmark, prog="python -m benchmarks.soak")
     came = soak(config)
     table = Table("", "")
-    first, last = came.memory[0][1], came.memory[-1][1]
+    first, last = came.memory[0][2], came.memory[-1][2]
+    waiting = max(row[3] for row in came.memory)
+    grew = f"{first:.0f} at first, {last:.0f} at last; once settled {came.growth:+.1f} a million decisions"
     for name, value in (
         ("decisions", f"{came.decisions:,} in {came.seconds / 60.0:.1f} min"),
-        ("memory [MB]", f"{first:.0f} at first, {last:.0f} at last; grew by {came.growth:+.1f} once settled"),
+        ("memory [MB]", grew),
         ("violating steps", f"{came.violating_steps}"),
         ("clients' faults", json.dumps(came.faults)),
         ("counted by /metrics", f"{came.counted:,}"),
-        ("recorded", f"{came.recorded:,}"),
+        ("recorded", f"{came.recorded:,}; at most {waiting:.1f} MB waited to be"),
         ("the service's complaints", came.complaints or "none"),
     ):
         table.add_row(name, value)

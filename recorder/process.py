@@ -5,7 +5,7 @@ how it stands. That it is another process keeps the work off the service's inter
 ended in order when the service is killed.
 
 The frames are: the settings; then lists of exchanges, of causes for a file of an incident, as texts, and of
-what decides from then on, as objects; None before an orderly end.
+what decides from then on, as objects, an empty one again and again; None before an orderly end.
 """
 
 from __future__ import annotations

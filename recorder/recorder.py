@@ -7,7 +7,6 @@ import logging
 import subprocess
 import sys
 import time
-from collections import deque
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass
@@ -16,6 +15,7 @@ from threading import Event, Thread
 from types import TracebackType
 from typing import IO, Any, Self, cast
 
+from recorder.backlog import Backlog
 from recorder.errors import RecordingError
 from recorder.frames import frame
 
@@ -71,9 +71,7 @@ class Recorder:
         self.dropped = 0
         self._stopped: dict[str, str] = {}
         self._status: dict[str, Any] = {}
-        self._waiting: deque[tuple[Any, ...] | str | dict[str, Any]] = deque()
-        # Each of the two is written by one thread.
-        self._taken = self._handed = 0
+        self._backlog = Backlog(MOST_WAITING)
         self._number = 0
         self._gone = False
         self._closing, self._ready = Event(), Event()
@@ -87,7 +85,7 @@ class Recorder:
         _widen(self._pipe)
         self._listener = Thread(target=self._listen, name="recorder listens", daemon=True)
         self._listener.start()
-        self._send(asdict(settings) | {"about": self._about(model)})
+        self._send(frame(asdict(settings) | {"about": self._about(model)}))
         if not self._ready.wait(_START_SECONDS) or self._failed is not None or self._gone:
             self._process.kill()
             self._process.wait()
@@ -101,9 +99,9 @@ class Recorder:
         return "; ".join(f"{what} stopped: {why}" for what, why in sorted(self._stopped.items())) or None
 
     def status(self) -> dict[str, Any]:
-        """How it stands, as plain JSON: alarm, dropped, recorded, incidents, last_incident."""
+        """How it stands, as plain JSON: alarm, dropped, waiting, recorded, incidents, last_incident."""
         told = {name: value for name, value in self._status.items() if name != "stopped"}
-        return {"alarm": self.alarm, "dropped": self.dropped} | told
+        return {"alarm": self.alarm, "dropped": self.dropped, "waiting": self._backlog.size} | told
 
     def record(
         self, received: int, client: tuple[str, int] | None, status: int, request: bytes, reply: bytes
@@ -120,12 +118,9 @@ class Recorder:
         if self._gone:
             return
         self._number += 1
-        size = len(request) + len(reply)
-        if self._taken - self._handed + size > MOST_WAITING:
+        exchange = self._number, received, time.time_ns(), client, status, request, reply
+        if not self._backlog.put([exchange]):
             self.dropped += 1
-            return
-        self._taken += size
-        self._waiting.append((self._number, received, time.time_ns(), client, status, request, reply))
 
     def incident(self, why: str) -> None:
         """Has the last half minute written; for alarms, from any thread.
@@ -133,7 +128,7 @@ class Recorder:
         Args:
             why: what has happened.
         """
-        self._waiting.append(why)
+        self._put(why)
 
     def change(self, model: Mapping[str, Any]) -> None:
         """Another one decides from now on: what follows has files of its own; from the thread of `record`.
@@ -141,7 +136,7 @@ class Recorder:
         Args:
             model: what decides, as `GET /model` tells it; with the same observation layout and filter.
         """
-        self._waiting.append(self._about(model))
+        self._put(self._about(model))
 
     def close(self) -> None:
         """Ends the recording: what was recorded up to now is written."""
@@ -165,26 +160,26 @@ class Recorder:
         """Ends the recording."""
         self.close()
 
+    def _put(self, value: str | dict[str, Any]) -> None:
+        """Has something wait that is seldom and small: it is never dropped."""
+        if not self._gone:
+            self._backlog.put([value], always=True)
+
     def _hand_on(self) -> None:
         """Sends what has been recorded, again and again, and at the end that it is the end."""
         logged, quiet = 0, 0.0
         while not self._gone:
             last = self._closing.wait(HAND_ON_SECONDS)
-            batch, size = [], 0
-            while self._waiting:
-                item = self._waiting.popleft()
-                batch.append(item)
-                size += len(item[-1]) + len(item[-2]) if isinstance(item, tuple) else 0
-            # An empty one as well: the other side has no clock of its own.
-            self._send(batch)
-            self._handed += size
-            if self.dropped > logged and time.monotonic() >= quiet:
-                logged, quiet = self.dropped, time.monotonic() + _QUIET_SECONDS
-                _LOG.warning("%d decisions were not recorded so far: too many at once", logged)
+            while not self._gone and self._backlog.hand_on(self._send):
+                if self.dropped > logged and time.monotonic() >= quiet:
+                    logged, quiet = self.dropped, time.monotonic() + _QUIET_SECONDS
+                    _LOG.warning("%d decisions were not recorded so far: too many at once", logged)
+            # The other side has no clock of its own.
+            self._send(frame([]))
             if last:
-                self._send(None)
+                self._send(frame(None))
                 break
-        self._waiting.clear()
+        self._backlog.clear()
         with suppress(OSError):
             self._pipe.close()
 
@@ -194,9 +189,9 @@ class Recorder:
         text = {"version": release, "model": json.dumps(model), "filter": json.dumps(self._filter_config)}
         return {"version": release, "text": text, "layout": list(model["observation_layout"])}
 
-    def _send(self, value: Any) -> None:
+    def _send(self, frames: bytes | memoryview) -> None:
         try:
-            self._pipe.write(frame(value))
+            self._pipe.write(frames)
             self._pipe.flush()
         except OSError:
             self._gone = True

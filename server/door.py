@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, cast
+from weakref import ref
 
 import httptools
 from uvicorn.config import Config
@@ -200,7 +201,8 @@ class Connection(Bounded, HttpToolsProtocol):
             # uvicorn would keep them all, however many come.
             raise httptools.HttpParserError("too many requests ahead of their answers")
         super().on_headers_complete()
-        extensions: dict[str, Any] = {AT_ONCE: partial(self._at_once, self.cycle)}
+        # The scope is the cycle's own: one that held it would be garbage that only the collector finds.
+        extensions: dict[str, Any] = {AT_ONCE: partial(self._at_once, ref(self.cycle))}
         self.scope["extensions"] = extensions | {FULL: self._door.full(self)}
 
     def handle_websocket_upgrade(self) -> None:
@@ -234,9 +236,10 @@ class Connection(Bounded, HttpToolsProtocol):
             self.transport.write(_TOO_SLOW)
         self.transport.close()
 
-    def _at_once(self, cycle: RequestResponseCycle, status: int, content: bytes) -> bool:
+    def _at_once(self, asked: ref[RequestResponseCycle], status: int, content: bytes) -> bool:
         """Answers a request with JSON in one packet; uvicorn would send head and body apart."""
-        if cycle.disconnected or self.flow.write_paused:
+        cycle = asked()
+        if cycle is None or cycle.disconnected or self.flow.write_paused:
             return False
         head = [STATUS_LINE[status], *(b"%b: %b\r\n" % header for header in cycle.default_headers)]
         if not cycle.keep_alive:

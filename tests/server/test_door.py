@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import http.client
 import json
 import select
@@ -18,6 +19,7 @@ from types import SimpleNamespace
 import pytest
 import uvicorn
 from starlette.types import Receive, Scope, Send
+from uvicorn.protocols.http.httptools_impl import RequestResponseCycle
 
 from evaluation.service import Service
 from server import Client
@@ -224,6 +226,22 @@ def test_the_robot_that_was_idle_longest_makes_room(small, key, connect: Connect
     assert closed(robots[1], 1.0)
     for robot in (robots[0], *robots[2:]):
         assert answered(robot, act(observation, key)).status == 200
+
+
+def test_a_request_that_is_answered_is_gone_without_the_collector(
+    small, key, connect: Connect, observation
+) -> None:
+    """Garbage that only the collector finds grows for minutes before it looks through what is old."""
+    robot = connect(small)
+    gc.collect()
+    gc.disable()
+    try:
+        for _ in range(40):
+            assert answered(robot, act(observation, key)).status == 200
+        kept = sum(type(one) is RequestResponseCycle for one in gc.get_objects())
+    finally:
+        gc.enable()
+    assert kept < 10  # a connection's last one
 
 
 @pytest.mark.parametrize(
