@@ -104,9 +104,8 @@ def test_robots_drive_on_while_one_worker_after_the_other_is_killed(service: Ser
     with Fleet(service.url, timeout=1.0) as fleet:
         episodes = run_episodes("PointGoal1-v0", fleet, 2, seed=31, progress=kill)
     assert episodes.violating_steps.tolist() == [0, 0]
-    # Each robot has lost at most the requests that were under way; then another worker had it.
+    # Each robot has lost at most the requests that were under way, or none; then another worker had it.
     assert len([reason for reason in episodes.reasons if reason.startswith("service")]) <= 4
-    assert episodes.reasons
     until(lambda: get(service, "/healthz")[1]["restarts"] == 2)
     until(lambda: get(service, "/healthz")[1]["ready"] == [1, 2])
     status, after = get(service, "/healthz")
