@@ -201,6 +201,8 @@ class Connection(Bounded, HttpToolsProtocol):
             # uvicorn would keep them all, however many come.
             raise httptools.HttpParserError("too many requests ahead of their answers")
         super().on_headers_complete()
+        if self.cycle is None or self.cycle.scope is not self.scope:
+            return  # it becomes a stream
         # The scope is the cycle's own: one that held it would be garbage that only the collector finds.
         extensions: dict[str, Any] = {AT_ONCE: partial(self._at_once, ref(self.cycle))}
         self.scope["extensions"] = extensions | {FULL: self._door.full(self)}
