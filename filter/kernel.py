@@ -149,9 +149,8 @@ def screen(
         u1, u2 = nominal[k]
         certified[k] = False
         if active[k]:
-            found = certify_one(config, obstacles[k], seen[k].count, state, u1, u2, config.hysteresis)
-            one.clearance, one.nearest, one.backup, one.steps = found
-            certified[k] = found[0] >= config.hysteresis
+            asked = nominal[k], config.hysteresis
+            certified[k] = certify(settings, seen, obstacles, k, *asked, certificates)
             refused += not certified[k]
         else:
             sure = seen[k].sure
@@ -257,6 +256,12 @@ def write_problem(
 
 
 @compiled
+def _reference(limit: float, action: FloatArray) -> tuple[float, float]:
+    """An action (2,) in the QP's variables, ``limit`` the largest u1."""
+    return min(max(action[0] / limit, -1.0), 1.0), min(max(action[1], -1.0), 1.0)
+
+
+@compiled
 def _by_qp(
     settings: Records,
     seen: Records,
@@ -272,7 +277,7 @@ def _by_qp(
     limit, least = config.robot.force_limit, needed(settings, seen, k)
     nearest, weights = max(certificates[k].nearest, 0), np.array((config.thrust_weight, 1.0))
     x, about, found, G, h = np.empty(2), np.empty(2), np.empty(2), np.empty((most, 2)), np.empty(most)
-    x[0], x[1] = min(max(action[0] / limit, -1.0), 1.0), min(max(action[1], -1.0), 1.0)
+    x[0], x[1] = _reference(limit, action)
     reference = x.copy()
     for trust in LINEARISATIONS:
         about[:] = x
@@ -360,7 +365,7 @@ def search(
         stands = math.hypot(now.zx, now.zy) <= _STANDS
         need = needed(settings, seen, k)
         enough = FAR if stands else need
-        wanted = min(max(action[j, 0] / limit, -1.0), 1.0), min(max(action[j, 1], -1.0), 1.0)
+        wanted = _reference(limit, action[j])
         best = FAR
         done[j] = False
         for i in range(_GRID * _GRID):
