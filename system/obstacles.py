@@ -73,7 +73,7 @@ def gap_segment(
     dx, dy = x1 - x0, y1 - y0
     qx, qy = x0 - obstacles[i, 0], y0 - obstacles[i, 1]
     square = dx * dx + dy * dy
-    if square < 1e-12:
+    if square < 1e-24:
         return gap(obstacles, i, x0, y0)
     # Where the segment is nearest to the first centre.
     at = -(qx * dx + qy * dy) / square

@@ -34,6 +34,7 @@ def test_gap_is_the_distance_to_the_nearest_disc(cone, x, y):
 
 @settings(deadline=None, max_examples=100)
 @given(cone=cones, start=st.tuples(places, places), end=st.tuples(places, places))
+@example(cone=(0.0, 1.0, 0.0, 0.0, 0.25, 0.0), start=(1.0, 0.0), end=(1.0, 1.9354341599762002e-07))
 def test_gap_to_a_segment_is_the_least_on_its_way(cone, start, end):
     way = np.linspace(0.0, 1.0, 300)[:, None]
     expected = min(gap(rows(cone), 0, *point) for point in np.array(start) + way * np.subtract(end, start))
